@@ -1,0 +1,1 @@
+"""The services: gateway, tracking and mapping. They meet only through `shared`."""

@@ -1,0 +1,155 @@
+"""Questions to the owner of a map: information, renders, exports, trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.camera import Intrinsics
+from shared.tracks import FrameRecord
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """A view of the map. Without a time the map's mean appearance is drawn."""
+
+    T_world_camera: NDArray[np.float64]  # [4, 4]
+    intrinsics: Intrinsics
+    appearance_t_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class RenderReply:
+    """A rendered view. Depth is 0 where alpha is 0; a view of nothing is black with alpha 0."""
+
+    revision: int
+    rgb: NDArray[np.uint8]  # [H, W, 3]
+    depth_m: NDArray[np.float32]  # [H, W], along the optical axis
+    alpha: NDArray[np.uint8]  # [H, W], 255 is opaque
+
+
+class ExportFormat(StrEnum):
+    """What a map can be written as."""
+
+    PLY = "ply"  # 3DGS splats
+    MESH = "mesh"  # triangle mesh, PLY
+    SNAPSHOT = "snapshot"  # tar of the session folder, to resume elsewhere
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """The map as a file; answered in pieces."""
+
+    format: ExportFormat
+
+
+@dataclass(frozen=True)
+class ExportChunk:
+    """One piece of an exported file."""
+
+    offset: int
+    total: int
+    bytes: bytes
+
+
+@dataclass(frozen=True)
+class RefineRequest:
+    """Optimise on all keyframes for so many iterations after the online phase."""
+
+    iterations: int
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """Progress of a refinement; answered at once, asked again until `is_running` is false."""
+
+    is_running: bool
+    iterations_done: int
+    iterations_total: int
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class SaveRequest:
+    """Write a snapshot now."""
+
+
+@dataclass(frozen=True)
+class SaveReply:
+    """A snapshot is on disk."""
+
+    revision: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class MapInfo:
+    """The state of a map, for people and for metrics."""
+
+    session: str
+    mapper: str
+    epoch: int
+    mode: str
+    map_revision: int
+    frames: int
+    keyframes: int
+    landmarks: int
+    primary_anchors: int
+    secondary_anchors: int
+    iterations: int
+    pending: int  # log entries not yet worked through
+    psnr_db: float | None  # running mean over the last training views
+    refinement: JobStatus
+    stages_ms: dict[str, float]  # medians of one optimization step
+    iteration_ms: float | None  # median of one optimization step
+    mapping_s: float  # time spent optimizing online
+    refinement_s: float
+    map_bytes: int  # anchors and networks, without optimizer state
+    device: str
+
+
+@dataclass(frozen=True)
+class TrajectoryRequest:
+    """All answered frames of a session."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Records as told to the client, and final poses (keyframe corrections applied)."""
+
+    records: tuple[FrameRecord, ...]
+    T_world_cameras_final: NDArray[np.float64]  # [F, 4, 4]
+    keyframe_seqs: NDArray[np.int64]  # [K]
+
+
+@dataclass(frozen=True)
+class Empty:
+    """A request or reply without content."""
+
+
+@dataclass(frozen=True)
+class DeleteRequest:
+    """Remove every byte of a session."""
+
+    session: str
+
+
+@dataclass(frozen=True)
+class SessionSummary:
+    """A session on a mapper's disk."""
+
+    session: str
+    created_ns: int
+    mode: str
+    keyframes: int
+    is_open: bool
+
+
+@dataclass(frozen=True)
+class SessionList:
+    """All sessions of a mapper."""
+
+    sessions: tuple[SessionSummary, ...]

@@ -1,0 +1,107 @@
+"""The process around a service: arguments, log, threads, and a clean end on SIGTERM."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from shared.config import override, read_overrides
+from shared.errors import PointSlamError
+
+C = TypeVar("C")
+
+
+def service_arguments(description: str | None) -> argparse.ArgumentParser:
+    """The arguments that every service takes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="zenoh router, such as tcp/127.0.0.1:7447; repeat for fail-over",
+    )
+    parser.add_argument("--id", default=f"{os.uname().nodename}-{os.getpid()}", help="unique name")
+    parser.add_argument("--config", type=Path, help="YAML file with settings of this service")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting, dotted key"
+    )
+    parser.add_argument("--json-log", action="store_true", help="one JSON object a line")
+    return parser
+
+
+def settings_from(arguments: argparse.Namespace, defaults: C) -> C:
+    """Defaults, overridden by --config and --set.
+
+    Raises:
+        ConfigError: a key is unknown or a value does not fit.
+    """
+    return override(defaults, read_overrides(arguments.config, arguments.set))
+
+
+def endpoints(arguments: argparse.Namespace) -> list[str]:
+    """The routers to connect to."""
+    return arguments.connect or ["tcp/127.0.0.1:7447"]
+
+
+class _JsonFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line)
+
+
+def setup_logging(as_json: bool = False) -> None:
+    """Log to standard error, one line an event."""
+    handler = logging.StreamHandler(sys.stderr)
+    text = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
+    handler.setFormatter(_JsonFormatter() if as_json else text)
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+
+
+def limit_blas_threads() -> None:
+    """One thread for BLAS and OpenMP: the small solvers lose by more, our own pools use the rest.
+
+    Must run before numpy is imported to hold for it; `python -m services.X` does so through the
+    environment that the launcher and the images set. Here it covers libraries loaded later.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def stop_event() -> threading.Event:
+    """An event that SIGTERM and SIGINT set."""
+    event = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: event.set())
+    return event
+
+
+def announce_ready(name: str) -> None:
+    """Tell whoever started this process that it serves: one line on standard output."""
+    sys.stdout.write(f"READY {name}\n")
+    sys.stdout.flush()
+
+
+def run_service(main: Callable[[list[str]], None], argv: list[str]) -> int:
+    """Call `main(argv)`; an error of ours becomes one line and exit code 2."""
+    try:
+        main(argv)
+    except PointSlamError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    return 0
