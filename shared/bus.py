@@ -11,34 +11,21 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from typing import Any
 
 import zenoh
 
 from shared import codec
-from shared.errors import (
-    ConfigError,
-    ConflictError,
-    InputError,
-    NotFoundError,
-    PointSlamError,
-    StorageError,
-    UnavailableError,
-)
+from shared.errors import GoneError, InputError, UnavailableError
+from shared.replies import answer_query, read_reply
 
 LOGGER = logging.getLogger(__name__)
 
 MAX_MESSAGE_BYTES = 256 << 20
 _LEASE_MS = 2000
 _ROOT = "ps/v1"
-
-_ERRORS: dict[str, type[PointSlamError]] = {
-    kind.code: kind
-    for kind in (ConfigError, ConflictError, NotFoundError, StorageError, UnavailableError)
-}
 
 
 class Keys:
@@ -78,21 +65,6 @@ class Keys:
     def alive(role: str, name: str) -> str:
         """Liveliness token of a process; role is tracking or mapping."""
         return f"{_ROOT}/alive/{role}/{name}"
-
-
-class GoneError(UnavailableError):
-    """Nobody answered: the process that did is gone. Another may be asked at once."""
-
-
-class TimedOutError(UnavailableError):
-    """The process is there but frozen or too slow."""
-
-
-@dataclass(frozen=True)
-class _Failure:
-    code: str
-    text: str
-    field: str = ""
 
 
 def zenoh_config(mode: str, connect: list[str], listen: list[str]) -> zenoh.Config:
@@ -180,7 +152,7 @@ class Bus:
             timeout=timeout_s,
         )
         for reply in replies:
-            return _read_reply(reply, key, kind)
+            return read_reply(reply, key, kind)
         raise GoneError(f"nobody answers {key}")
 
     async def ask(self, key: str, message: object, kind: type, timeout_s: float) -> Any:
@@ -211,7 +183,7 @@ class Bus:
             timeout=timeout_s,
         )
         while (reply := await replies.get()) is not None:
-            yield _read_reply(reply, key, kind)
+            yield read_reply(reply, key, kind)
 
     def serve(
         self,
@@ -228,9 +200,9 @@ class Bus:
 
         def handle(query: zenoh.Query) -> None:
             if executor is None:
-                _answer(query, key, kind, answer)
+                answer_query(query, key, kind, answer)
             else:
-                executor.submit(_answer, query, key, kind, answer)
+                executor.submit(answer_query, query, key, kind, answer)
 
         queryable = self._session.declare_queryable(key, handle, complete=True)
         self._declared.append(queryable)
@@ -286,34 +258,14 @@ class Bus:
         )
         self._declared.append(subscriber)
 
+    def require_alive(self, role: str, prefix: str) -> None:
+        """Look once for a process of a role whose name starts with `prefix`.
 
-def _read_reply(reply: zenoh.Reply, key: str, kind: type) -> Any:
-    if reply.ok is not None:
-        return codec.unpack(kind, reply.ok.payload.to_bytes())
-    assert reply.err is not None
-    payload = reply.err.payload.to_bytes()
-    if payload == b"Timeout":
-        raise TimedOutError(f"no answer in time from {key}")
-    try:
-        failure = codec.unpack(_Failure, payload)
-    except InputError:
-        raise UnavailableError(f"{key}: {payload[:200]!r}") from None
-    if failure.code == InputError.code:
-        raise InputError(failure.field, failure.text)
-    raise _ERRORS.get(failure.code, PointSlamError)(failure.text)
-
-
-def _answer(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any], object]) -> None:
-    with query:
-        try:
-            payload = query.payload.to_bytes() if query.payload is not None else b""
-            result = answer(codec.unpack(kind, payload))
-            for piece in result if isinstance(result, Iterator) else (result,):
-                query.reply(key, codec.pack(piece))
-        except InputError as error:
-            query.reply_err(codec.pack(_Failure(error.code, error.reason, error.field)))
-        except PointSlamError as error:
-            query.reply_err(codec.pack(_Failure(error.code, str(error))))
-        except Exception:
-            LOGGER.exception("%s: the answer failed", key)
-            query.reply_err(codec.pack(_Failure("error", "internal error; see the service's log")))
+        Raises:
+            UnavailableError: there is none; names those that there are.
+        """
+        replies = self._session.liveliness().get(Keys.alive(role, "*"), timeout=3.0)
+        names = [str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None]
+        if not any(name.startswith(prefix) for name in names):
+            found = ", ".join(sorted(names)) or "none"
+            raise UnavailableError(f"no {role} service named {prefix}* is alive; alive: {found}")

@@ -57,6 +57,14 @@ class UnavailableError(PointSlamError):
     code = "unavailable"
 
 
+class GoneError(UnavailableError):
+    """Nobody answered: the process that did is gone. Another may be asked at once."""
+
+
+class TimedOutError(UnavailableError):
+    """The process is there but frozen or too slow."""
+
+
 class StorageError(PointSlamError):
     """The disk refused (full, read-only) or holds a file that fails its checksum."""
 

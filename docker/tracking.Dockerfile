@@ -1,0 +1,18 @@
+# The tracking service alone: only its own code and shared/ are in the image.
+#   docker build -f docker/tracking.Dockerfile -t pointslam/tracking .
+FROM python:3.11-slim
+
+ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_WAIT_POLICY=passive PYTHONUNBUFFERED=1
+WORKDIR /app
+COPY pyproject.toml README.md requirements.lock ./
+COPY shared/ shared/
+COPY services/__init__.py services/__init__.py
+COPY services/tracking/ services/tracking/
+COPY pointslam/__init__.py pointslam/__init__.py
+RUN pip install --no-cache-dir -c requirements.lock ".[tracking]" \
+    && useradd --create-home --uid 10001 pointslam \
+    && mkdir -p /data && chown pointslam /data /app
+USER pointslam
+HEALTHCHECK --interval=10s --timeout=8s --start-period=60s \
+    CMD ["python", "-m", "shared.probe", "tracking", "--connect", "tcp/router:7447"]
+ENTRYPOINT ["python", "-m", "services.tracking"]

@@ -1,0 +1,25 @@
+"""Is a service of this host alive? Exit code 0 if it is: the containers' health check."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from shared.bus import open_bus
+from shared.service import endpoints, run_service
+
+
+def main(argv: list[str]) -> None:
+    """Look for a liveliness token of the role whose name starts with this host's name."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("role", choices=["tracking", "mapping"])
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT")
+    parser.add_argument("--prefix", default=os.uname().nodename, help="start of the service's --id")
+    arguments = parser.parse_args(argv)
+    with open_bus(endpoints(arguments), wait_s=3.0) as bus:
+        bus.require_alive(arguments.role, arguments.prefix)
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(main, sys.argv[1:]))

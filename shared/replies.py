@@ -1,0 +1,70 @@
+"""How an answer crosses the bus: a message, a message in pieces, or an error of ours."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from shared import codec
+from shared.errors import (
+    ConfigError,
+    ConflictError,
+    InputError,
+    NotFoundError,
+    PointSlamError,
+    StorageError,
+    TimedOutError,
+    UnavailableError,
+)
+
+LOGGER = logging.getLogger(__name__)
+
+_ERRORS: dict[str, type[PointSlamError]] = {
+    kind.code: kind
+    for kind in (ConfigError, ConflictError, NotFoundError, StorageError, UnavailableError)
+}
+
+
+@dataclass(frozen=True)
+class _Failure:
+    code: str
+    text: str
+    field: str = ""
+
+
+def read_reply(reply: zenoh.Reply, key: str, kind: type) -> Any:
+    """The message in a reply, or the error that the other side raised, rebuilt and raised here."""
+    if reply.ok is not None:
+        return codec.unpack(kind, reply.ok.payload.to_bytes())
+    assert reply.err is not None
+    payload = reply.err.payload.to_bytes()
+    if payload == b"Timeout":
+        raise TimedOutError(f"no answer in time from {key}")
+    try:
+        failure = codec.unpack(_Failure, payload)
+    except InputError:
+        raise UnavailableError(f"{key}: {payload[:200]!r}") from None
+    if failure.code == InputError.code:
+        raise InputError(failure.field, failure.text)
+    raise _ERRORS.get(failure.code, PointSlamError)(failure.text)
+
+
+def answer_query(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any], object]) -> None:
+    """Reply to a query with what `answer` returns or raises; always finishes the query."""
+    with query:
+        try:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            result = answer(codec.unpack(kind, payload))
+            for piece in result if isinstance(result, Iterator) else (result,):
+                query.reply(key, codec.pack(piece))
+        except InputError as error:
+            query.reply_err(codec.pack(_Failure(error.code, error.reason, error.field)))
+        except PointSlamError as error:
+            query.reply_err(codec.pack(_Failure(error.code, str(error))))
+        except Exception:
+            LOGGER.exception("%s: the answer failed", key)
+            query.reply_err(codec.pack(_Failure("error", "internal error; see the service's log")))
