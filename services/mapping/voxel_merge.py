@@ -1,0 +1,92 @@
+"""Clouds of several keyframes as one: what falls into one voxel and faces one way is averaged."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.se3 import rotate, transform
+from shared.tracks import PointCloud
+
+
+def merge_clouds(
+    clouds_camera: list[PointCloud],
+    T_world_cameras: list[NDArray[np.float64]],
+    voxel_size_m: float,
+) -> PointCloud:
+    """Merge clouds in the world frame, each point weighted by the precision of its depth.
+
+    Args:
+        clouds_camera: one cloud a camera; normals of unit length.
+        T_world_cameras: their poses.
+        voxel_size_m: side of the voxels.
+
+    Returns:
+        one point a voxel and main direction of the normal, in order of first sight.
+    """
+    points, normals, weights = [], [], []
+    for cloud, T_world_camera in zip(clouds_camera, T_world_cameras, strict=True):
+        points.append(transform(T_world_camera, cloud.points.astype(np.float64)))
+        normals.append(rotate(T_world_camera, cloud.normals))
+        weights.append(_depth_precision(cloud.points[:, 2]))
+    merged_points, merged_normals = _merge_voxels(
+        np.concatenate(points), np.concatenate(normals), np.concatenate(weights), voxel_size_m
+    )
+    return PointCloud(merged_points, merged_normals)
+
+
+def _depth_precision(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inverse variance of structured-light depth, 1/m^2 (Nguyen et al., 3DIMPVT 2012)."""
+    sigma_m = 0.0012 + 0.0019 * np.square(np.maximum(depth_m - 0.4, 0.0))
+    return (1.0 / np.square(sigma_m)).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _merge_voxels(points, normals, weights, voxel_size):  # pragma: no cover - compiled
+    count = len(points)
+    capacity = 16
+    while capacity < 2 * count:
+        capacity *= 2
+    keys = np.full(capacity, -1, np.int64)
+    slots = np.zeros(capacity, np.int32)
+    sums = np.zeros((count, 7), np.float64)
+    used = 0
+    for i in range(count):
+        key = _voxel_key(points[i], normals[i], voxel_size)
+        slot = (key * np.int64(-7046029254386353131)) >> np.int64(20) & np.int64(capacity - 1)
+        while keys[slot] != -1 and keys[slot] != key:
+            slot = (slot + 1) & (capacity - 1)
+        if keys[slot] == -1:
+            keys[slot] = key
+            slots[slot] = used
+            used += 1
+        row = sums[slots[slot]]
+        w = np.float64(weights[i])
+        for axis in range(3):
+            row[axis] += w * points[i, axis]
+            row[3 + axis] += w * normals[i, axis]
+        row[6] += w
+    merged_points = np.empty((used, 3), np.float32)
+    merged_normals = np.empty((used, 3), np.float32)
+    for i in range(used):
+        row = sums[i]
+        length = np.sqrt(row[3] ** 2 + row[4] ** 2 + row[5] ** 2)
+        for axis in range(3):
+            merged_points[i, axis] = row[axis] / row[6]
+            merged_normals[i, axis] = row[3 + axis] / length
+    return merged_points, merged_normals
+
+
+@numba.njit(cache=True, nogil=True)
+def _voxel_key(point, normal, voxel_size):  # pragma: no cover - compiled
+    # Two sides of a thin wall must not be averaged, so the main direction of the normal counts.
+    axis = 0
+    for i in range(1, 3):
+        if abs(normal[i]) > abs(normal[axis]):
+            axis = i
+    direction = 2 * axis + (1 if normal[axis] > 0.0 else 0)
+    key = np.int64(direction)
+    for i in range(3):
+        key = (key << 20) | (np.int64(np.floor(point[i] / voxel_size)) & np.int64(0xFFFFF))
+    return key
