@@ -1,0 +1,67 @@
+"""Recorded sequences: one file a format, found by what lies in the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pointslam.datasets.base import (
+    FileSequence,
+    Sequence,
+    SequenceFrame,
+    SequenceOptions,
+    View,
+    is_held_out,
+)
+from pointslam.datasets.folder import is_folder, read_folder
+from pointslam.datasets.replica import is_replica, read_replica
+from pointslam.datasets.scannetpp import (
+    is_dslr,
+    is_iphone,
+    is_scene,
+    read_dslr,
+    read_iphone,
+    read_scene,
+)
+from pointslam.datasets.seven_scenes import is_seven_scenes, read_seven_scenes
+from pointslam.datasets.tum import is_tum, read_tum
+from shared.errors import SequenceError
+
+__all__ = [
+    "FileSequence",
+    "Sequence",
+    "SequenceFrame",
+    "SequenceOptions",
+    "View",
+    "is_held_out",
+    "open_sequence",
+]
+
+Detect = Callable[[Path], bool]
+Read = Callable[[Path, SequenceOptions], FileSequence]
+
+# Asked in this order: our own folders have TUM's lists too.
+FORMATS: dict[str, tuple[Detect, Read]] = {
+    "calibration.json folder": (is_folder, read_folder),
+    "TUM RGB-D": (is_tum, read_tum),
+    "Replica": (is_replica, read_replica),
+    "7-Scenes": (is_seven_scenes, read_seven_scenes),
+    "ScanNet++ scene": (is_scene, read_scene),
+    "ScanNet++ iPhone": (is_iphone, read_iphone),
+    "ScanNet++ DSLR": (is_dslr, read_dslr),
+}
+
+
+def open_sequence(path: Path | str, options: SequenceOptions | None = None) -> FileSequence:
+    """Open a folder of any format we know.
+
+    Raises:
+        SequenceError: names the file that cannot be read and what is wrong with it.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise SequenceError(path, "is no folder" if path.exists() else "does not exist")
+    for detect, read in FORMATS.values():
+        if detect(path):
+            return read(path, options or SequenceOptions())
+    raise SequenceError(path, f"is of no known format; known are {', '.join(FORMATS)}")
