@@ -1,0 +1,85 @@
+"""A router, stand-ins on its bus, and a real gateway process: what the gateway's tests and
+benchmark run against."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+from benchmarks.stand_ins import StandInMapper, StandInTracker
+from shared.bus import Bus, open_bus, open_router
+
+
+@dataclass(frozen=True)
+class LocalGateway:
+    """A running gateway and what is behind it."""
+
+    url: str
+    grpc_address: str
+    router: str
+    pid: int
+    bus: Bus
+    trackers: tuple[StandInTracker, ...]
+    mapper: StandInMapper
+
+
+def free_port() -> int:
+    """A port of this host that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+@contextmanager
+def local_gateway(num_trackers: int = 1, *settings: str) -> Iterator[LocalGateway]:
+    """Start everything; `settings` are key=value words of the gateway."""
+    with ExitStack() as stack:
+        router = f"tcp/127.0.0.1:{free_port()}"
+        stack.callback(open_router(router).close)
+        bus = stack.enter_context(open_bus([router]))
+        # Each on a connection of its own, as separate services are.
+        trackers = tuple(
+            StandInTracker(stack.enter_context(open_bus([router])), f"tracker-{i}")
+            for i in range(num_trackers)
+        )
+        mapper = StandInMapper(stack.enter_context(open_bus([router])), "mapper-0")
+        ports = (free_port(), free_port())
+        process = stack.enter_context(gateway_process(router, ports, *settings))
+        yield LocalGateway(
+            url=f"http://127.0.0.1:{ports[0]}",
+            grpc_address=f"127.0.0.1:{ports[1]}",
+            router=router,
+            pid=process.pid,
+            bus=bus,
+            trackers=trackers,
+            mapper=mapper,
+        )
+
+
+@contextmanager
+def gateway_process(
+    router: str, ports: tuple[int, int], *settings: str
+) -> Iterator[subprocess.Popen[str]]:
+    """A gateway process, from when it is ready until it has ended."""
+    command = [sys.executable, "-m", "services.gateway", "--connect", router]
+    command += ["--http-port", str(ports[0]), "--grpc-port", str(ports[1])]
+    command += [word for setting in settings for word in ("--set", setting)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert line.startswith("READY"), line
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()

@@ -1,0 +1,260 @@
+"""Participants on the real bus that answer with plain values, and a gateway process before them.
+
+They let the gateway be measured and tested by itself: a tracker that takes a given time, a mapper
+that keeps records in memory.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shared import se3
+from shared.bus import Bus, Keys
+from shared.errors import ConflictError, NotFoundError
+from shared.frames import HAS_POSE, TrackingStatus, TrackRequest
+from shared.images import decode_colour, decode_depth
+from shared.maps import (
+    DeleteRequest,
+    Empty,
+    ExportChunk,
+    ExportRequest,
+    JobStatus,
+    MapInfo,
+    RefineRequest,
+    RenderReply,
+    RenderRequest,
+    SaveReply,
+    SaveRequest,
+    SessionList,
+    SessionSummary,
+    Trajectory,
+    TrajectoryRequest,
+)
+from shared.tracks import (
+    Advance,
+    AdvanceReply,
+    Correction,
+    KeyframeData,
+    KeyframePoses,
+    Observations,
+    OpenReply,
+    OpenRequest,
+    PointCloud,
+    TrackResult,
+)
+
+STEP_M = 0.01  # the camera moves so far along x from one frame number to the next
+KEYFRAME_EVERY = 10
+
+
+class StandInTracker:
+    """Answers each frame with a pose that its number tells, after `delay_s`."""
+
+    def __init__(self, bus: Bus, name: str) -> None:
+        self.name = name
+        self.delay_s = 0.0
+        self.status = TrackingStatus.TRACKED
+        self.decodes = False
+        self.requests: list[TrackRequest] = []
+        bus.serve(Keys.track(name), TrackRequest, self.answer)
+        bus.declare_alive("tracking", name)
+
+    def answer(self, request: TrackRequest) -> TrackResult:
+        """The answer to one frame."""
+        self.requests.append(request)
+        del self.requests[:-100]
+        if self.decodes:
+            decode_colour(request.frame.rgb, request.calibration.colour.intrinsics)
+            decode_depth(request.frame.depth, request.calibration)
+        time.sleep(self.delay_s)
+        frame, prior = request.frame, request.prior
+        reference = prior.newest_keyframe_seq if prior else frame.seq
+        is_keyframe = prior is None or frame.seq - reference >= KEYFRAME_EVERY
+        T_world_camera = request.T_world_first @ se3.exp([STEP_M * frame.seq, 0, 0, 0, 0, 0])
+        T_world_reference = request.T_world_first @ se3.exp([STEP_M * reference, 0, 0, 0, 0, 0])
+        return TrackResult(
+            seq=frame.seq,
+            t_ns=frame.t_ns,
+            status=self.status,
+            T_world_camera=T_world_camera,
+            covariance=1e-6 * np.eye(6),
+            reference_seq=reference,
+            T_reference_camera=se3.inverse(T_world_reference) @ T_world_camera,
+            inliers=100,
+            inlier_share=0.5,
+            map_revision=request.map_revision,
+            timings_ms={"decode": 1.0},
+            keyframe=_keyframe() if is_keyframe and self.status in HAS_POSE else None,
+        )
+
+
+def _keyframe() -> KeyframeData:
+    nothing = np.zeros((0, 3), np.float32)
+    observations = Observations(
+        landmark_ids=np.zeros(0, np.int64),
+        keypoints_px=np.zeros((0, 2), np.float32),
+        octaves=np.zeros(0, np.uint8),
+        depths_m=np.zeros(0, np.float32),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
+    correction = Correction(
+        keyframe_seqs=np.zeros(0, np.int64),
+        T_world_keyframes=np.zeros((0, 4, 4)),
+        landmark_ids=np.zeros(0, np.int64),
+        positions_world=np.zeros((0, 3)),
+    )
+    thumbnail = np.zeros((15, 20), np.uint8)
+    return KeyframeData(observations, nothing, PointCloud(nothing, nothing), thumbnail, correction)
+
+
+@dataclass
+class _Map:
+    request: OpenRequest
+    epoch: int
+    entries: list[Advance] = field(default_factory=list)
+    refinement: JobStatus = field(default_factory=lambda: JobStatus(False, 0, 0))
+    stops: list = field(default_factory=list)
+
+    def keyframes(self) -> list[Advance]:
+        return [entry for entry in self.entries if entry.keyframe is not None]
+
+    def poses(self) -> KeyframePoses:
+        keyframes = self.keyframes()
+        poses = [entry.record.T_world_camera for entry in keyframes]
+        return KeyframePoses(
+            revision=len(keyframes),
+            seqs=np.array([entry.record.seq for entry in keyframes], np.int64),
+            T_world_keyframes=np.array(poses).reshape(-1, 4, 4),
+        )
+
+
+class StandInMapper:
+    """Keeps the entries of its sessions in `disk`, which another mapper may share."""
+
+    def __init__(self, bus: Bus, name: str, disk: dict[str, _Map] | None = None) -> None:
+        self.name = name
+        self.disk: dict[str, _Map] = {} if disk is None else disk
+        self._bus = bus
+        self._lock = threading.Lock()
+        bus.serve(Keys.mapper(name, "open"), OpenRequest, self.open)
+        bus.serve(Keys.mapper(name, "list"), Empty, self.list)
+        bus.serve(Keys.mapper(name, "delete"), DeleteRequest, self.delete)
+        bus.declare_alive("mapping", name)
+
+    def open(self, request: OpenRequest) -> OpenReply:
+        """Create a session, or own one that exists in a new epoch."""
+        with self._lock:
+            known = self.disk.get(request.session)
+            if request.calibration is None and known is None:
+                raise NotFoundError(f"no session {request.session}")
+            if request.calibration is not None and known is not None:
+                raise ConflictError(f"session {request.session} exists")
+            known = known or _Map(request, 0)
+            known.epoch += 1
+            self.disk[request.session] = known
+            self._serve(request.session, known)
+        assert known.request.calibration is not None
+        return OpenReply(
+            session=request.session,
+            mapper=self.name,
+            epoch=known.epoch,
+            mode=known.request.mode,
+            map_revision=len(known.keyframes()),
+            created_ns=time.time_ns(),
+            calibration=known.request.calibration,
+            T_world_first=known.request.T_world_first,
+            last=known.entries[-1].record if known.entries else None,
+            keyframe_poses=known.poses(),
+        )
+
+    def list(self, _: Empty) -> SessionList:
+        """All sessions."""
+        rows = [
+            SessionSummary(name, 0, known.request.mode, len(known.keyframes()), True)
+            for name, known in self.disk.items()
+        ]
+        return SessionList(tuple(rows))
+
+    def delete(self, request: DeleteRequest) -> Empty:
+        """Forget a session."""
+        if request.session not in self.disk:
+            raise NotFoundError(f"no session {request.session}")
+        for stop in self.disk.pop(request.session).stops:
+            stop()
+        return Empty()
+
+    def _serve(self, session: str, known: _Map) -> None:
+        answers = {
+            "advance": (Advance, lambda entry: _advance(known, entry)),
+            "keyframes": (Empty, lambda _: known.poses()),
+            "render": (RenderRequest, lambda request: _render(known, request)),
+            "export": (ExportRequest, _export),
+            "refine": (RefineRequest, lambda request: _refine(known, request)),
+            "interrupt": (Empty, lambda _: known.refinement),
+            "save": (SaveRequest, lambda _: SaveReply(len(known.keyframes()), 1000)),
+            "info": (Empty, lambda _: self._info(session, known)),
+            "trajectory": (TrajectoryRequest, lambda _: _trajectory(known)),
+        }
+        known.stops = [
+            self._bus.serve(Keys.session(session, known.epoch, question), kind, answer)
+            for question, (kind, answer) in answers.items()
+        ]
+
+    def _info(self, session: str, known: _Map) -> MapInfo:
+        return MapInfo(
+            session=session,
+            mapper=self.name,
+            epoch=known.epoch,
+            mode=known.request.mode,
+            map_revision=len(known.keyframes()),
+            frames=len(known.entries),
+            keyframes=len(known.keyframes()),
+            landmarks=0,
+            primary_anchors=0,
+            secondary_anchors=0,
+            iterations=0,
+            pending=0,
+            psnr_db=None,
+            refinement=known.refinement,
+            stages_ms={},
+            iteration_ms=None,
+            mapping_s=0.0,
+            refinement_s=0.0,
+            map_bytes=0,
+            device="cpu",
+        )
+
+
+def _advance(known: _Map, entry: Advance) -> AdvanceReply:
+    if not known.entries or entry.record.seq > known.entries[-1].record.seq:
+        known.entries.append(entry)
+    return AdvanceReply(known.entries[-1].record.seq, len(known.keyframes()))
+
+
+def _render(known: _Map, request: RenderRequest) -> RenderReply:
+    size = (request.intrinsics.height, request.intrinsics.width)
+    rgb = np.full((*size, 3), 128, np.uint8)
+    return RenderReply(
+        len(known.keyframes()), rgb, np.full(size, 1.5, np.float32), np.full(size, 255, np.uint8)
+    )
+
+
+def _export(_: ExportRequest) -> Iterator[ExportChunk]:
+    for offset in range(0, 3000, 1000):
+        yield ExportChunk(offset, 3000, bytes([offset // 1000]) * 1000)
+
+
+def _refine(known: _Map, request: RefineRequest) -> JobStatus:
+    known.refinement = JobStatus(False, request.iterations, request.iterations)
+    return JobStatus(True, 0, request.iterations)
+
+
+def _trajectory(known: _Map) -> Trajectory:
+    records = tuple(entry.record for entry in known.entries)
+    finals = np.array([record.T_world_camera for record in records]).reshape(-1, 4, 4)
+    return Trajectory(records, finals, known.poses().seqs)

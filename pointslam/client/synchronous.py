@@ -1,0 +1,243 @@
+"""The synchronous client."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from pointslam.client import calls
+from pointslam.client.frame_stream import stream_frames
+from pointslam.client.messages import FrameOptions, frame_message
+from pointslam.client.progress import POLL_S, Progress, pending, refinement
+from shared.camera import Calibration, Intrinsics
+from shared.errors import UnavailableError
+from shared.frames import ColourImage, DepthImage
+from shared.maps import ExportFormat, RenderReply
+from shared.stream import FrameMessage, FrameReply
+
+T = TypeVar("T")
+
+
+class Client:
+    """A gateway; a context manager. Not for use by several threads at once."""
+
+    def __init__(self, url: str = "http://127.0.0.1:8080") -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.Client(base_url=self.url)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections; sessions go on."""
+        self._http.close()
+
+    def ready(self) -> bool:
+        """Whether the gateway answers and sessions can be created and tracked."""
+        try:
+            return self.call(calls.ready())
+        except UnavailableError:
+            return False
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """All sessions, those on disk too, newest first."""
+        return self.call(calls.list_sessions())
+
+    def create_session(
+        self,
+        calibration: Calibration,
+        *,
+        name: str | None = None,
+        mode: str = "live",
+        seed: int = 0,
+        T_map_first: NDArray[np.float64] | None = None,
+    ) -> Session:
+        """A new session, offline (no frame is lost, runs repeat) or live (newest frame wins).
+
+        Raises:
+            InputError: names the field of the calibration that no camera has.
+            ConflictError: a session of that name exists.
+            UnavailableError: no mapper is there.
+        """
+        new = calls.NewSession(calibration, name, mode, seed, T_map_first)
+        return Session(self, self.call(calls.create_session(new)))
+
+    def session(self, name: str) -> Session:
+        """A session that exists, taken up again from disk if need be.
+
+        Raises:
+            NotFoundError: there is none of that name.
+        """
+        return Session(self, self.call(calls.info(name)))
+
+    def call(self, call: calls.Call[T]) -> T:
+        """Send one call and read its answer.
+
+        Raises:
+            PointSlamError: the gateway refused.
+            UnavailableError: it does not answer.
+        """
+        try:
+            response = self._http.request(call.method, call.path, **call.arguments())
+        except httpx.TransportError as error:
+            raise _unreachable(self.url, error) from None
+        return call.answer(response)
+
+    def download(self, path: str, params: dict[str, str], target: Path) -> None:
+        """Fetch a file piece by piece."""
+        arguments = {"params": params, "timeout": calls.SLOW_S}
+        try:
+            with self._http.stream("GET", path, **arguments) as response:
+                if not response.is_success:
+                    response.read()
+                    raise calls.error_from(calls.problem_of(response))
+                with target.open("wb") as file:
+                    for piece in response.iter_bytes():
+                        file.write(piece)
+        except httpx.TransportError as error:
+            raise _unreachable(self.url, error) from None
+
+
+class Session:
+    """One session; counts its frames."""
+
+    def __init__(self, client: Client, info: dict[str, Any]) -> None:
+        self.name: str = info["session"]
+        self.mode: str = info["mode"]
+        self.next_seq: int = info["tracking"]["last_seq"] + 1
+        self._credit: int = info["tracking"]["credit"]
+        self._client = client
+
+    def frame(
+        self,
+        rgb: NDArray[np.uint8] | ColourImage,
+        depth: NDArray[np.uint16] | DepthImage,
+        t_ns: int,
+        options: FrameOptions | None = None,
+    ) -> FrameMessage:
+        """The next frame, numbered, for `stream`."""
+        self.next_seq += 1
+        return frame_message(self.next_seq - 1, t_ns, rgb, depth, options)
+
+    def track(
+        self,
+        rgb: NDArray[np.uint8] | ColourImage,
+        depth: NDArray[np.uint16] | DepthImage,
+        t_ns: int,
+        *,
+        may_be_keyframe: bool = True,
+        T_odom_camera: NDArray[np.float64] | None = None,
+    ) -> FrameReply:
+        """Send one frame and wait for its pose.
+
+        Args:
+            rgb: colour, [H, W, 3], or an encoded image.
+            depth: raw sensor values, [H, W] (metres are raw / depth_scale), or an encoded image.
+            t_ns: the device's clock, nanoseconds; grows from frame to frame.
+            may_be_keyframe: False keeps the frame out of the map.
+            T_odom_camera: the device's own odometry, [4, 4].
+
+        Raises:
+            PointSlamError: the frame was refused; the session goes on.
+        """
+        options = FrameOptions(may_be_keyframe, T_odom_camera)
+        message = frame_message(self.next_seq, t_ns, rgb, depth, options)
+        reply = self._client.call(calls.track(self.name, message))
+        self.next_seq = message.seq + 1
+        return reply
+
+    def stream(self, frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
+        """Send frames over a WebSocket and yield their replies in order.
+
+        Offline, as many are under way as the gateway gives credit for; live, each is sent when
+        `frames` yields it, and a reply may say SUPERSEDED. A refused frame's reply has `error`.
+
+        Raises:
+            UnavailableError: the connection broke.
+        """
+        url = calls.stream_url(self._client.url, self.name)
+        credit = self._credit if self.mode == "offline" else None
+        for reply in stream_frames(url, frames, credit):
+            self.next_seq = max(self.next_seq, reply.seq + 1)
+            yield reply
+
+    def pose(self, t_ns: int | None = None) -> NDArray[np.float64]:
+        """T_map_camera, [4, 4]: the newest, or at a time, interpolated.
+
+        Raises:
+            NotFoundError: there is no pose (at that time).
+        """
+        return self._client.call(calls.pose(self.name, t_ns))
+
+    def poses(self, kind: str = "final") -> list[tuple[int, NDArray[np.float64]]]:
+        """(t_ns, T_map_camera) of every tracked frame, `online` as told or `final` as of now."""
+        return calls.poses_of(self.trajectory(), kind)
+
+    def trajectory(self) -> list[calls.TrajectoryRecord]:
+        """Every answered frame."""
+        return self._client.call(calls.trajectory(self.name))
+
+    def render(
+        self,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: Intrinsics | None = None,
+        appearance_t_ns: int | None = None,
+    ) -> RenderReply:
+        """A view of the map; without intrinsics, through the session's colour camera."""
+        return self._client.call(
+            calls.render(self.name, T_world_camera, intrinsics, appearance_t_ns)
+        )
+
+    def info(self) -> dict[str, Any]:
+        """State of the map (fields of MapInfo) and of tracking."""
+        return self._client.call(calls.info(self.name))
+
+    def refine(self, iterations: int, progress: Progress | None = None) -> None:
+        """Optimise the map on all keyframes; returns when done.
+
+        Raises:
+            PointSlamError: the refinement failed.
+        """
+        self._client.call(calls.refine(self.name, iterations))
+        is_running = True
+        while is_running:
+            time.sleep(POLL_S)
+            is_running, done, total = refinement(self.info())
+            if progress is not None:
+                progress(done, total)
+
+    def wait_until_mapped(self, progress: Progress | None = None) -> None:
+        """Wait until the map has worked through every answered frame."""
+        most = left = pending(self.info())
+        while left > 0:
+            time.sleep(POLL_S)
+            left = pending(self.info())
+            most = max(most, left)
+            if progress is not None:
+                progress(most - left, most)
+
+    def save(self) -> dict[str, Any]:
+        """Write a snapshot; returns when it is on disk."""
+        return self._client.call(calls.save(self.name))
+
+    def export(self, format: ExportFormat | str, path: Path | str) -> None:
+        """The map as a file: ply (splats), mesh or snapshot."""
+        params = {"format": str(ExportFormat(format))}
+        self._client.download(calls.export_path(self.name), params, Path(path))
+
+    def delete(self) -> None:
+        """Remove the session and every byte of it."""
+        self._client.call(calls.delete(self.name))
+
+
+def _unreachable(url: str, error: Exception) -> UnavailableError:
+    return UnavailableError(f"{url} does not answer ({type(error).__name__}: {error})")

@@ -1,0 +1,101 @@
+"""Gateway: clients' frames in over HTTP, WebSocket and gRPC; poses and views out."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+
+import uvicorn
+
+from services.gateway.app import create_app, open_sessions
+from services.gateway.config import GatewayConfig
+from services.gateway.sessions import Sessions
+from shared.bus import Bus, open_bus
+from shared.errors import UnavailableError
+from shared.service import (
+    announce_ready,
+    endpoints,
+    limit_blas_threads,
+    run_service,
+    service_arguments,
+    settings_from,
+    setup_logging,
+)
+
+
+_UNREAD_MS = 30_000
+
+
+class _Server(uvicorn.Server):
+    """uvicorn without its own signal handling, which would end the process by the signal."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        announce_ready("gateway")
+
+
+def main(argv: list[str]) -> None:
+    """Read settings, connect, serve until SIGTERM."""
+    parser = service_arguments(__doc__)
+    parser.add_argument("--http-host", default="127.0.0.1", help="address of HTTP and gRPC")
+    parser.add_argument("--http-port", type=int, default=8080)
+    parser.add_argument("--grpc-port", type=int, default=50051)
+    arguments = parser.parse_args(argv)
+    limit_blas_threads()
+    setup_logging(arguments.json_log)
+    config = settings_from(arguments, GatewayConfig())
+    listener = _listen(arguments.http_host, arguments.http_port)
+    with listener, open_bus(endpoints(arguments)) as bus:
+        loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
+        with asyncio.Runner(loop_factory=loop_factory) as runner:
+            runner.run(_serve(bus, config, listener, arguments))
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        listener = socket.create_server((host, port), backlog=512)
+    except OSError as error:
+        raise UnavailableError(f"cannot listen on {host}:{port}: {error}") from None
+    # Connections inherit it: the kernel drops a client that acknowledges nothing for so long.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
+    return listener
+
+
+async def _serve(
+    bus: Bus, config: GatewayConfig, listener: socket.socket, arguments: Namespace
+) -> None:
+    sessions = open_sessions(bus, config)
+    server = _Server(_uvicorn_config(sessions, config))
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, setattr, server, "should_exit", True)
+    await server.serve([listener])
+
+
+def _uvicorn_config(sessions: Sessions, config: GatewayConfig) -> uvicorn.Config:
+    return uvicorn.Config(
+        create_app(sessions),
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        ws="websockets-sansio",
+        ws_max_size=config.limits.max_message_bytes,
+        ws_per_message_deflate=False,
+        ws_ping_interval=config.stream.ping_interval_s,
+        ws_ping_timeout=config.stream.ping_timeout_s,
+        limit_concurrency=config.limits.max_connections,
+        timeout_graceful_shutdown=int(config.drain_s),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(main, sys.argv[1:]))

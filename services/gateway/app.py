@@ -1,0 +1,55 @@
+"""The gateway's application: sessions on the bus, served over HTTP and WebSocket."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+
+from services.gateway.body_limit import BodyLimit
+from services.gateway.config import GatewayConfig
+from services.gateway.dispatch import TrackerPool
+from services.gateway.http import http_routes
+from services.gateway.map_http import map_routes
+from services.gateway.members import Members
+from services.gateway.owner import Fabric
+from services.gateway.problems import add_handlers
+from services.gateway.sessions import Sessions
+from services.gateway.websocket import websocket_routes
+from shared.bus import Bus
+
+_DESCRIPTION = """RGB-D frames in, camera poses and views of a neural-Gaussian map out.
+
+Poses are `T_map_camera`: camera to map, metres, named quaternion fields, OpenCV axes (x right,
+y down, z forward). Times are nanoseconds of the client's clock. Errors are problem documents
+(RFC 9457) with `code`, `field` and `reason`. Frames stream over the WebSocket
+`/v1/sessions/{name}/stream` as the msgpack messages that `POST .../frames` takes."""
+
+
+def open_sessions(bus: Bus, config: GatewayConfig) -> Sessions:
+    """The sessions of a gateway on this bus; call it on the event loop."""
+    trackers = TrackerPool(bus, Members(bus, "tracking"), config.dispatch)
+    return Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config))
+
+
+def create_app(sessions: Sessions) -> FastAPI:
+    """The HTTP and WebSocket side."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        await sessions.close()
+
+    app = FastAPI(
+        title="PointSLAM++",
+        version="1",
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        redoc_url=None,
+    )
+    for router in (http_routes(sessions), map_routes(sessions), websocket_routes(sessions)):
+        app.include_router(router)
+    add_handlers(app)
+    app.add_middleware(BodyLimit, max_bytes=sessions.fabric.config.limits.max_message_bytes)
+    return app

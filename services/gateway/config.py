@@ -1,0 +1,94 @@
+"""Settings of the gateway: limits, time-outs and sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from shared.errors import ConfigError
+
+
+def _check_positive(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if value <= 0:
+            raise ConfigError(f"{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """What a client may send and ask for."""
+
+    max_message_bytes: int = 32 << 20  # an HTTP body, a WebSocket message, a gRPC message
+    max_render_pixels: int = 4 << 20
+    max_refine_iterations: int = 1_000_000
+    max_connections: int = 512
+    max_waiting_frames: int = 8  # of one offline session, beyond what its credits allow
+
+    def __post_init__(self) -> None:
+        _check_positive(
+            self, "max_message_bytes", "max_render_pixels", "max_connections", "max_waiting_frames"
+        )
+
+
+@dataclass(frozen=True)
+class DispatchConfig:
+    """The pool of tracking workers."""
+
+    first_frame_timeout_s: float = 20.0  # a worker's first frame of a session fills its caches
+    live_timeout_s: float = 2.0
+    offline_timeout_s: float = 30.0
+    live_wait_s: float = 3.0  # how long a frame waits for a worker to appear
+    offline_wait_s: float = 60.0
+    quarantine_s: float = 5.0  # a worker that timed out gets no frames for so long
+    load_cap: float = 1.25  # sessions of one worker over the mean of all
+    idle_s: float = 10.0  # a session without frames for so long loads no worker
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "first_frame_timeout_s", "live_timeout_s", "offline_timeout_s")
+        if self.load_cap < 1.0:
+            raise ConfigError(f"load_cap must be at least 1, got {self.load_cap}")
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """Questions to the owners of maps."""
+
+    advance_timeout_s: float = 120.0  # an offline mapper delays its reply to bound its queue
+    open_timeout_s: float = 60.0
+    question_timeout_s: float = 30.0
+    probe_timeout_s: float = 5.0  # whether an owner that went out of sight is still there
+    export_timeout_s: float = 300.0
+    reopen_wait_s: float = 30.0  # how long a session waits for a live mapper
+    retry_s: float = 0.2
+    live_entries: int = 256  # answered frames that a live session holds unacknowledged
+    keyframe_wait_s: float = 2.0  # a live session waits so long for a keyframe's acknowledgement
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "advance_timeout_s", "question_timeout_s", "retry_s", "live_entries")
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Frame and pose streams."""
+
+    credit: int = 2  # frames in flight and waiting: one each
+    live_unanswered: int = 64  # of a live stream; superseded ones are answered in order
+    send_timeout_s: float = 5.0  # a client that does not read for so long is cut off
+    ping_interval_s: float = 30.0
+    ping_timeout_s: float = 120.0
+    poses: int = 4096  # answered frames kept for `pose?t_ns=`
+    max_gap_s: float = 1.0  # poses further apart are not interpolated between
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "credit", "live_unanswered", "send_timeout_s", "poses", "max_gap_s")
+
+
+@dataclass(frozen=True)
+class GatewayConfig:
+    """All settings of the gateway."""
+
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    dispatch: DispatchConfig = field(default_factory=DispatchConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    stream: StreamConfig = field(default_factory=StreamConfig)
+    drain_s: float = 10.0  # time to finish what is in flight at SIGTERM

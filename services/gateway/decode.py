@@ -1,0 +1,168 @@
+"""What a client sent, checked before anything is decoded or allocated for it.
+
+Only headers are read here: an image of another size than the calibration's is refused by its
+header, so a small file that claims 60000x60000 pixels costs nothing. Trackers decode.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, TypeVar
+
+from services.gateway.errors import MESSAGE
+from shared import codec
+from shared.camera import Calibration, Intrinsics
+from shared.errors import InputError
+from shared.frames import ColourEncoding, DepthEncoding
+from shared.stream import FLAGS, FrameMessage
+
+T = TypeVar("T")
+
+MAX_SEQ = 1 << 46  # a landmark's id is its keyframe's seq with 16 more bits
+MAX_T_NS = 1 << 62
+_TAIL = 64  # an image's end marker may be followed by so many bytes of padding
+_PNG = b"\x89PNG\r\n\x1a\n"
+_GREY, _RGB, _RGBA = 0, 2, 6
+# Start-of-frame markers carry the size; C4, C8 and CC are tables that share the range.
+_SOF = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def read_frame(data: bytes, calibration: Calibration) -> FrameMessage:
+    """A checked frame from a msgpack message.
+
+    Raises:
+        InputError: names the field.
+    """
+    message = named_from(FrameMessage, codec.unpack, data)
+    check_frame(message, calibration)
+    return message
+
+
+def plain(kind: type[T], value: Any) -> T:
+    """A dataclass from JSON, with field names as the client wrote them."""
+    return named_from(kind, codec.from_plain, value)
+
+
+def named_from(kind: type[T], convert: Any, value: Any) -> T:
+    """`convert(kind, value)` with errors that name the field without our class's name."""
+    try:
+        return convert(kind, value)
+    except InputError as error:
+        field = error.field.removeprefix(kind.__name__).lstrip(".")
+        raise InputError(field or MESSAGE, error.reason) from None
+
+
+def check_frame(message: FrameMessage, calibration: Calibration) -> None:
+    """Refuse a frame whose fields or image headers do not fit the calibration.
+
+    Raises:
+        InputError: names the field, what was found and what would do.
+    """
+    _check_range("seq", message.seq, MAX_SEQ)
+    _check_range("t_ns", message.t_ns, MAX_T_NS)
+    for flag in message.flags:
+        if flag not in FLAGS:
+            raise InputError("flags", f"unknown flag {flag[:40]!r}; known: {', '.join(FLAGS)}")
+    scale = message.depth.scale
+    if scale is not None and scale != calibration.depth_scale:
+        raise InputError(
+            "depth.scale", f"is {scale}, the calibration says {calibration.depth_scale}"
+        )
+    if message.prior is not None:
+        _check_pose(message)
+    _check_colour(message.rgb.encoding, message.rgb.bytes, calibration.colour.intrinsics)
+    size = calibration.depth_camera().intrinsics
+    _check_depth(message.depth.encoding, message.depth.bytes, size)
+
+
+def _check_range(field: str, value: int, limit: int) -> None:
+    if not 0 <= value < limit:
+        raise InputError(field, f"must be 0 to {limit - 1}, got {value}")
+
+
+def _check_pose(message: FrameMessage) -> None:
+    assert message.prior is not None
+    try:
+        message.prior.T_odom_camera.matrix()
+    except InputError as error:
+        raise InputError(f"prior.T_odom_camera.{error.field}", error.reason) from None
+
+
+def _check_colour(encoding: ColourEncoding, data: bytes, size: Intrinsics) -> None:
+    field = "rgb.bytes"
+    if encoding is ColourEncoding.RGB8:
+        _check_length(data, 3 * size.width * size.height, field)
+    elif encoding is ColourEncoding.JPEG:
+        _check_jpeg(data, size, field)
+    else:
+        depth, colour = _check_png(data, size, field)
+        if depth != 8 or colour not in (_GREY, _RGB, _RGBA):
+            raise InputError(
+                field, f"must be an 8 bit grey or RGB PNG, got {depth} bit of colour type {colour}"
+            )
+
+
+def _check_depth(encoding: DepthEncoding, data: bytes, size: Intrinsics) -> None:
+    field, rows = "depth.bytes", 2 * size.width * size.height
+    if encoding is DepthEncoding.RAW16:
+        _check_length(data, rows, field)
+    elif encoding is DepthEncoding.ZLIB16:
+        # zlib grows what it cannot pack by a few bytes in 16 kB.
+        limit = rows + rows // 1000 + 64
+        if not 8 <= len(data) <= limit:
+            raise InputError(field, f"must be 8 to {limit} bytes of zlib, got {len(data)}")
+    else:
+        depth, colour = _check_png(data, size, field)
+        if depth != 16 or colour != _GREY:
+            raise InputError(
+                field, f"must be a 16 bit grey PNG, got {depth} bit of colour type {colour}"
+            )
+
+
+def _check_length(data: bytes, expected: int, field: str) -> None:
+    if len(data) != expected:
+        raise InputError(field, f"must be {expected} bytes, got {len(data)}")
+
+
+def _check_size(found: tuple[int, int], size: Intrinsics, field: str) -> None:
+    if found != (size.width, size.height):
+        raise InputError(
+            field,
+            f"is {found[0]}x{found[1]}, the calibration says {size.width}x{size.height}",
+        )
+
+
+def _check_png(data: bytes, size: Intrinsics, field: str) -> tuple[int, int]:
+    """Bit depth and colour type of a PNG whose header has the right size."""
+    if len(data) < 57 or not data.startswith(_PNG) or data[12:16] != b"IHDR":
+        raise InputError(field, f"{len(data)} bytes that do not start as a PNG")
+    width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
+    _check_size((width, height), size, field)
+    if b"IEND" not in data[-_TAIL:]:
+        raise InputError(field, f"a truncated PNG ({len(data)} bytes, no end chunk)")
+    return depth, colour
+
+
+def _check_jpeg(data: bytes, size: Intrinsics, field: str) -> None:
+    if not data.startswith(b"\xff\xd8"):
+        raise InputError(field, f"{len(data)} bytes that do not start as a JPEG")
+    precision, height, width = _jpeg_frame(data, field)
+    _check_size((width, height), size, field)
+    if precision != 8:
+        raise InputError(field, f"must be 8 bit, got {precision}")
+    if b"\xff\xd9" not in data[-_TAIL:]:
+        raise InputError(field, f"a truncated JPEG ({len(data)} bytes, no end marker)")
+
+
+def _jpeg_frame(data: bytes, field: str) -> tuple[int, int, int]:
+    """Precision, height and width from the start-of-frame segment."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker in _SOF:
+            return struct.unpack(">BHH", data[at + 4 : at + 9])
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    raise InputError(field, f"a JPEG of {len(data)} bytes without a frame header")

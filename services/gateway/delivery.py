@@ -1,0 +1,80 @@
+"""Answered frames on their way to the owner of the map: in order, each until acknowledged."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+
+from services.gateway.config import MappingConfig
+from services.gateway.owner import MapOwner
+from shared.errors import PointSlamError
+from shared.tracks import Advance
+
+LOGGER = logging.getLogger(__name__)
+
+
+class Delivery:
+    """The unacknowledged entries of a live session, a bounded ring, and the task that sends them.
+
+    When the ring is full the next frame waits, so a map without an owner slows its session down
+    and loses nothing.
+    """
+
+    def __init__(self, owner: MapOwner, config: MappingConfig) -> None:
+        self._owner = owner
+        self._config = config
+        self._entries: deque[Advance] = deque()
+        self._task: asyncio.Task[None] | None = None
+        self._changed = asyncio.Condition()
+        self._failure: PointSlamError | None = None
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    async def put(self, entry: Advance) -> None:
+        """Add an entry; waits while the ring is full.
+
+        Raises:
+            PointSlamError: the ring is full because the owner refuses what is in it.
+        """
+        async with self._changed:
+            while len(self._entries) >= self._config.live_entries:
+                if self._failure is not None:
+                    raise self._failure
+                await self._changed.wait()
+        self._entries.append(entry)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._send_all())
+
+    async def flush(self, timeout_s: float) -> bool:
+        """Wait until all entries are acknowledged; false when the time was over first."""
+        try:
+            async with asyncio.timeout(timeout_s), self._changed:
+                await self._changed.wait_for(lambda: not self._entries)
+        except TimeoutError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Give up what is not acknowledged."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _send_all(self) -> None:
+        while self._entries:
+            try:
+                if self._entries[0].record.seq > self._owner.logged_seq:
+                    await self._owner.advance(self._entries[0])
+            except PointSlamError as error:
+                LOGGER.warning("%s: map entry not taken: %s", self._owner.session, error)
+                await self._tell(error)
+                await asyncio.sleep(self._config.retry_s)
+                continue
+            self._entries.popleft()
+            await self._tell(None)
+
+    async def _tell(self, failure: PointSlamError | None) -> None:
+        self._failure = failure
+        async with self._changed:
+            self._changed.notify_all()

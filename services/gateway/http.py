@@ -1,0 +1,126 @@
+"""HTTP: sessions, frames, poses, trajectories, health."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import JSONResponse, Response
+
+from services.gateway import examples
+from services.gateway.decode import plain, read_frame
+from services.gateway.errors import MESSAGE
+from services.gateway.poses import TimedPose, deviations
+from services.gateway.sessions import CreateRequest, Sessions
+from services.gateway.trajectory import fetch_trajectory, trajectory_json, trajectory_tum
+from shared import codec
+from shared.errors import InputError, UnavailableError
+from shared.se3 import Pose
+
+MSGPACK = "application/msgpack"
+
+
+def http_routes(sessions: Sessions) -> APIRouter:
+    """The routes of sessions and frames."""
+    router = APIRouter()
+    _add_session_routes(router, sessions)
+    _add_pose_routes(router, sessions)
+    _add_health_routes(router, sessions)
+    return router
+
+
+def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
+    @router.post("/v1/sessions", status_code=201, openapi_extra=examples.CREATE_SESSION)
+    async def create_session(request: Request) -> Response:
+        """Create a session with the device's calibration."""
+        create = plain(CreateRequest, await _json(request))
+        session = await sessions.create(create)
+        location = {"Location": f"/v1/sessions/{session.name}"}
+        return JSONResponse(await sessions.info(session), 201, location)
+
+    @router.get("/v1/sessions")
+    async def list_sessions() -> dict[str, Any]:
+        """All sessions, those on disk too, newest first."""
+        return {"sessions": await sessions.list()}
+
+    @router.get("/v1/sessions/{name}")
+    async def get_session(name: str) -> dict[str, Any]:
+        """State of the session's map and of its tracking."""
+        return await sessions.info(await sessions.get(name))
+
+    @router.delete("/v1/sessions/{name}", status_code=204)
+    async def delete_session(name: str) -> None:
+        """Remove the session and every byte of it."""
+        await sessions.delete(name)
+
+    @router.post("/v1/sessions/{name}/frames", openapi_extra=examples.POST_FRAME)
+    async def post_frame(name: str, request: Request) -> Response:
+        """Track one frame: a msgpack FrameMessage in, a FrameReply out (JSON if accepted)."""
+        session = await sessions.get(name)
+        message = read_frame(await request.body(), session.calibration)
+        reply = await session.track(message)
+        if "json" in request.headers.get("accept", ""):
+            return JSONResponse(codec.to_json(reply))
+        return Response(codec.pack(reply), media_type=MSGPACK)
+
+
+def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
+    @router.get("/v1/sessions/{name}/pose")
+    async def get_pose(name: str, t_ns: int | None = None) -> dict[str, Any]:
+        """The newest pose, or the pose at a time of the client's clock, interpolated."""
+        return pose_json((await sessions.get(name)).pose(t_ns))
+
+    @router.get("/v1/sessions/{name}/trajectory")
+    async def get_trajectory(name: str) -> dict[str, Any]:
+        """Every answered frame: status, pose as told, pose in the map as it is now."""
+        return trajectory_json(await fetch_trajectory(await sessions.get(name)))
+
+    @router.get("/v1/sessions/{name}/trajectory.tum")
+    async def get_trajectory_tum(
+        name: str, kind: Annotated[str, Query(pattern="^(online|final)$")] = "final"
+    ) -> Response:
+        """The trajectory as a TUM file (t tx ty tz qx qy qz qw), one line a tracked frame."""
+        trajectory = await fetch_trajectory(await sessions.get(name))
+        return Response(trajectory_tum(trajectory, kind), media_type="text/plain")
+
+
+def _add_health_routes(router: APIRouter, sessions: Sessions) -> None:
+    @router.get("/healthz")
+    async def health() -> dict[str, str]:
+        """The process answers."""
+        return {"status": "ok"}
+
+    @router.get("/readyz")
+    async def ready() -> dict[str, Any]:
+        """A session can be created and tracked: a tracking worker and a mapper are alive."""
+        members = {
+            "trackers": sessions.fabric.trackers.count(),
+            "mappers": len(sessions.fabric.mappers.names),
+        }
+        if not sessions.is_ready():
+            counts = ", ".join(f"{count} {role}" for role, count in members.items())
+            raise UnavailableError(f"not ready: {counts} alive")
+        return {"status": "ready", **members}
+
+
+def pose_json(pose: TimedPose) -> dict[str, Any]:
+    """A pose as plain JSON values, with named quaternion fields."""
+    deviation = deviations(pose.covariance)
+    return {
+        "seq": pose.seq,
+        "t_ns": pose.t_ns,
+        "status": str(pose.status),
+        "T_map_camera": codec.to_json(Pose.from_matrix(pose.T_map_camera)),
+        "pos_std_m": deviation[0] if deviation else None,
+        "rot_std_deg": deviation[1] if deviation else None,
+        "reference_seq": pose.reference_seq,
+        "map_revision": pose.map_revision,
+        "is_interpolated": pose.is_interpolated,
+    }
+
+
+async def _json(request: Request) -> Any:
+    try:
+        return await request.json()
+    except (ValueError, RecursionError) as error:
+        raise InputError(MESSAGE, f"not JSON ({str(error)[:200]})") from None

@@ -1,0 +1,216 @@
+"""HTTP: views of the map, the map as a file, refinement and snapshots."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from starlette.responses import Response, StreamingResponse
+
+from services.gateway import examples
+from services.gateway.config import GatewayConfig
+from services.gateway.decode import plain
+from services.gateway.session import Session
+from services.gateway.sessions import Sessions
+from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, pose_from
+from shared import codec
+from shared.errors import InputError, UnavailableError
+from shared.maps import (
+    Empty,
+    ExportChunk,
+    ExportFormat,
+    ExportRequest,
+    JobStatus,
+    RefineRequest,
+    RenderReply,
+    RenderRequest,
+    SaveReply,
+    SaveRequest,
+)
+
+_SUFFIXES = {ExportFormat.PLY: "ply", ExportFormat.MESH: "mesh.ply", ExportFormat.SNAPSHOT: "tar"}
+
+
+@dataclass(frozen=True)
+class PoseQuery:
+    """Camera to map: position in metres, quaternion."""
+
+    px: float = 0.0
+    py: float = 0.0
+    pz: float = 0.0
+    qx: float = 0.0
+    qy: float = 0.0
+    qz: float = 0.0
+    qw: float = 1.0
+
+
+@dataclass(frozen=True)
+class CameraQuery:
+    """Pixels; without them the session's colour camera, scaled where only a size is given."""
+
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    width: int | None = None
+    height: int | None = None
+
+
+@dataclass(frozen=True)
+class ViewQuery:
+    """What is drawn (colour or depth), as what (jpeg, png, msgpack), in whose appearance."""
+
+    what: str = "colour"
+    format: str = "jpeg"
+    appearance_t_ns: int | None = None
+
+
+def map_routes(sessions: Sessions) -> APIRouter:
+    """The routes of the map."""
+    router = APIRouter()
+    _add_render_route(router, sessions)
+    _add_file_routes(router, sessions)
+    _add_job_routes(router, sessions)
+    return router
+
+
+def _add_render_route(router: APIRouter, sessions: Sessions) -> None:
+    config = sessions.fabric.config
+
+    @router.get(
+        "/v1/sessions/{name}/render",
+        response_class=Response,
+        responses=examples.binary(*MEDIA_TYPES.values()),
+    )
+    async def render(
+        name: str,
+        request: Request,
+        pose: Annotated[PoseQuery, Depends()],
+        camera: Annotated[CameraQuery, Depends()],
+        wanted: Annotated[ViewQuery, Depends()],
+    ) -> Response:
+        """A view of the map as an image; If-None-Match with its ETag answers 304."""
+        session = await sessions.get(name)
+        view = _view(session, pose, camera, wanted)
+        view.check(config.limits.max_render_pixels)
+        known = request.headers.get("if-none-match", "")
+        if view.etag(session.owner.revision) in known:
+            return Response(status_code=304, headers={"ETag": view.etag(session.owner.revision)})
+        reply = await ask_render(session, view.request, config)
+        # Encoding takes 10 ms and more; frames go on meanwhile.
+        content = await asyncio.to_thread(view.encode, reply)
+        headers = {"ETag": view.etag(reply.revision), "Cache-Control": "no-cache"}
+        return Response(content, 200, headers, MEDIA_TYPES[view.format])
+
+
+def _add_file_routes(router: APIRouter, sessions: Sessions) -> None:
+    responses = examples.binary("application/octet-stream")
+
+    @router.get(
+        "/v1/sessions/{name}/map.ply", response_class=StreamingResponse, responses=responses
+    )
+    async def get_ply(name: str) -> Response:
+        """The map as 3D Gaussian splats, in the file format of splat viewers."""
+        session = await sessions.get(name)
+        return await _file(session, ExportFormat.PLY, sessions.fabric.config)
+
+    @router.get("/v1/sessions/{name}/map", response_class=StreamingResponse, responses=responses)
+    async def get_map(name: str, format: ExportFormat) -> Response:
+        """The map as a file: splats, a triangle mesh, or a snapshot to resume elsewhere."""
+        return await _file(await sessions.get(name), format, sessions.fabric.config)
+
+
+def _add_job_routes(router: APIRouter, sessions: Sessions) -> None:
+    limits = sessions.fabric.config.limits
+    timeout_s = sessions.fabric.config.mapping.question_timeout_s
+
+    @router.post("/v1/sessions/{name}/refine", status_code=202, openapi_extra=examples.REFINE)
+    async def refine(name: str, request: Request) -> dict[str, Any]:
+        """Start to optimise on all keyframes; the session's state shows the progress."""
+        session = await sessions.get(name)
+        try:
+            wanted = plain(RefineRequest, await request.json())
+        except ValueError as error:
+            raise InputError("message", f"not JSON ({str(error)[:200]})") from None
+        if not 0 < wanted.iterations <= limits.max_refine_iterations:
+            raise InputError("iterations", f"must be 1 to {limits.max_refine_iterations}")
+        await session.flush(timeout_s)
+        return codec.to_json(await session.owner.ask("refine", wanted, JobStatus, timeout_s))
+
+    @router.post("/v1/sessions/{name}/refine/interrupt")
+    async def interrupt(name: str) -> dict[str, Any]:
+        """Stop the refinement; what it has done stays."""
+        owner = (await sessions.get(name)).owner
+        return codec.to_json(await owner.ask("interrupt", Empty(), JobStatus, timeout_s))
+
+    @router.post("/v1/sessions/{name}/save")
+    async def save(name: str) -> dict[str, Any]:
+        """Write a snapshot now; answers when it is on disk."""
+        session = await sessions.get(name)
+        await session.flush(timeout_s)
+        export_s = sessions.fabric.config.mapping.export_timeout_s
+        reply = await session.owner.ask("save", SaveRequest(), SaveReply, export_s)
+        return codec.to_json(reply)
+
+
+def _view(session: Session, pose: PoseQuery, camera: CameraQuery, wanted: ViewQuery) -> View:
+    lens = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    colour = session.calibration.colour.intrinsics
+    return View(
+        request=RenderRequest(
+            T_world_camera=pose_from(vars(pose)),
+            intrinsics=intrinsics_from(lens, camera.width, camera.height, colour),
+            appearance_t_ns=wanted.appearance_t_ns,
+        ),
+        what=wanted.what,
+        format=wanted.format,
+    )
+
+
+async def ask_render(
+    session: Session, request: RenderRequest, config: GatewayConfig
+) -> RenderReply:
+    """A view drawn by the owner of the session's map."""
+    timeout_s = config.mapping.question_timeout_s
+    return await session.owner.ask("render", request, RenderReply, timeout_s)
+
+
+async def export_pieces(
+    session: Session, format: ExportFormat, config: GatewayConfig
+) -> AsyncIterator[ExportChunk]:
+    """The file in pieces, checked to be in order and complete.
+
+    Raises:
+        UnavailableError: the owner went away before the end.
+    """
+    await session.flush(config.mapping.question_timeout_s)
+    timeout_s = config.mapping.export_timeout_s
+    at = total = 0
+    request = ExportRequest(format)
+    async for piece in session.owner.pieces("export", request, ExportChunk, timeout_s):
+        if piece.offset != at:
+            raise UnavailableError(f"the export broke off at byte {at}")
+        at, total = at + len(piece.bytes), piece.total
+        yield piece
+    if at != total:
+        raise UnavailableError(f"the export ended at byte {at} of {total}")
+
+
+async def _file(session: Session, format: ExportFormat, config: GatewayConfig) -> Response:
+    pieces = export_pieces(session, format, config)
+    first = await anext(pieces)  # an error here still becomes a status
+
+    async def content() -> AsyncIterator[bytes]:
+        yield first.bytes
+        async for piece in pieces:
+            yield piece.bytes
+
+    name = f"{session.name}.{_SUFFIXES[format]}"
+    headers = {
+        "Content-Length": str(first.total),
+        "Content-Disposition": f'attachment; filename="{name}"',
+    }
+    return StreamingResponse(content(), 200, headers, "application/octet-stream")

@@ -1,0 +1,169 @@
+"""The owner of a session's map, found again when it is gone."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Any
+
+from services.gateway.config import GatewayConfig
+from services.gateway.dispatch import TrackerPool
+from services.gateway.members import Members
+from shared.bus import Bus, Keys
+from shared.errors import (
+    ConflictError,
+    GoneError,
+    NotFoundError,
+    TimedOutError,
+    UnavailableError,
+)
+from shared.maps import Empty
+from shared.tracks import Advance, AdvanceReply, KeyframePoses, OpenReply, OpenRequest
+
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Fabric:
+    """What every session uses: the bus, the live processes, the settings."""
+
+    bus: Bus
+    trackers: TrackerPool
+    mappers: Members
+    config: GatewayConfig
+
+
+class MapOwner:
+    """One session's map: which mapper owns it, in which epoch, at which revision."""
+
+    def __init__(self, fabric: Fabric, opened: OpenReply) -> None:
+        self.session = opened.session
+        self.mapper = opened.mapper
+        self.epoch = opened.epoch
+        self.acknowledged_revision = opened.map_revision
+        self.logged_seq = opened.last.seq if opened.last else -1
+        self.keyframes = opened.keyframe_poses
+        self._mode = opened.mode
+        self._fabric = fabric
+        self._config = fabric.config.mapping
+        self._reopening = asyncio.Lock()
+        loop = asyncio.get_running_loop()
+
+        def heard(poses: KeyframePoses) -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(self._publish, poses)
+
+        self.close = fabric.bus.subscribe(Keys.revisions(self.session), KeyframePoses, heard)
+
+    @property
+    def revision(self) -> int:
+        """The newest revision heard of, by reply or publication."""
+        return max(self.acknowledged_revision, self.keyframes.revision)
+
+    async def advance(self, entry: Advance) -> None:
+        """Log one answered frame; returns when the owner has acknowledged it.
+
+        Raises:
+            PointSlamError: the owner refused it, or there is none.
+        """
+        reply = await self.ask("advance", entry, AdvanceReply, self._config.advance_timeout_s)
+        self.acknowledged_revision = max(self.acknowledged_revision, reply.map_revision)
+        self.logged_seq = max(self.logged_seq, reply.acknowledged_seq)
+
+    async def ask(self, question: str, message: object, kind: type, timeout_s: float) -> Any:
+        """Ask the owner; when it is gone, open the session on a live mapper and ask again.
+
+        Raises:
+            PointSlamError: what the owner raised.
+            UnavailableError: no mapper took the session up in time.
+        """
+        deadline = time.monotonic() + self._config.reopen_wait_s
+        while True:
+            epoch = self.epoch
+            try:
+                return await self._fabric.bus.ask(
+                    Keys.session(self.session, epoch, question), message, kind, timeout_s
+                )
+            except GoneError:
+                await self.reopen(epoch, deadline)
+            except TimedOutError:
+                if self.mapper in self._fabric.mappers.names:
+                    raise
+                await self.reopen(epoch, deadline)
+
+    async def pieces(
+        self, question: str, message: object, kind: type, timeout_s: float
+    ) -> AsyncIterator[Any]:
+        """Ask the owner for a reply in pieces; a gone owner ends it with an error."""
+        key = Keys.session(self.session, self.epoch, question)
+        is_empty = True
+        async for piece in self._fabric.bus.ask_stream(key, message, kind, timeout_s):
+            is_empty = False
+            yield piece
+        if is_empty:
+            raise GoneError(f"nobody answers {key}")
+
+    async def reopen(self, epoch: int, deadline: float) -> None:
+        """Open the session on a live mapper, unless another call did so since `epoch`.
+
+        Raises:
+            UnavailableError: no mapper took it up before the deadline (monotonic seconds).
+        """
+        async with self._reopening:
+            while self.epoch == epoch:
+                await asyncio.sleep(self._config.retry_s)
+                if await self._is_back():
+                    return
+                if not await self._open_anywhere() and time.monotonic() > deadline:
+                    raise UnavailableError(f"no mapper has session {self.session} at present")
+
+    async def _is_back(self) -> bool:
+        """Whether the old owner only was out of sight (its router restarted)."""
+        key = Keys.session(self.session, self.epoch, "keyframes")
+        try:
+            self.keyframes = await ask_keyframes(self._fabric, key)
+        except UnavailableError:
+            return False
+        return True
+
+    async def _open_anywhere(self) -> bool:
+        names = sorted(self._fabric.mappers.names, key=lambda name: name != self.mapper)
+        for name in names:
+            try:
+                opened = await ask_open(self._fabric, name, OpenRequest(self.session, self._mode))
+            except (UnavailableError, NotFoundError, ConflictError) as error:
+                LOGGER.info("%s: mapper %s does not take it: %s", self.session, name, error)
+                continue
+            self._take(opened)
+            return True
+        return False
+
+    def _take(self, opened: OpenReply) -> None:
+        LOGGER.warning(
+            "%s: map now owned by %s, epoch %d", self.session, opened.mapper, opened.epoch
+        )
+        self.mapper = opened.mapper
+        self.epoch = opened.epoch
+        self.acknowledged_revision = opened.map_revision
+        self.keyframes = opened.keyframe_poses
+        if opened.last is not None:
+            self.logged_seq = opened.last.seq
+
+    def _publish(self, poses: KeyframePoses) -> None:
+        if poses.revision >= self.keyframes.revision:
+            self.keyframes = poses
+
+
+async def ask_open(fabric: Fabric, mapper: str, request: OpenRequest) -> OpenReply:
+    """Open or create a session on one mapper."""
+    timeout_s = fabric.config.mapping.open_timeout_s
+    return await fabric.bus.ask(Keys.mapper(mapper, "open"), request, OpenReply, timeout_s)
+
+
+async def ask_keyframes(fabric: Fabric, key: str) -> KeyframePoses:
+    """Present keyframe poses of a session."""
+    timeout_s = fabric.config.mapping.probe_timeout_s
+    return await fabric.bus.ask(key, Empty(), KeyframePoses, timeout_s)

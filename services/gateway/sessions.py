@@ -1,0 +1,188 @@
+"""All sessions that this gateway knows: create, find, list, delete."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import uuid
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from services.gateway.dispatch import choose
+from services.gateway.owner import Fabric, ask_open
+from services.gateway.session import Session
+from shared import codec
+from shared.bus import Keys
+from shared.camera import Calibration
+from shared.errors import (
+    ConflictError,
+    InputError,
+    NotFoundError,
+    PointSlamError,
+    UnavailableError,
+)
+from shared.maps import DeleteRequest, Empty, MapInfo, SessionList
+from shared.se3 import Pose
+from shared.tracks import OpenRequest
+
+MODES = ("live", "offline")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+_MAX_SEED = 1 << 31
+
+
+@dataclass(frozen=True)
+class CreateRequest:
+    """What a client says to create a session."""
+
+    calibration: Calibration
+    name: str | None = None
+    mode: str = "live"
+    seed: int = 0
+    T_map_first: Pose | None = None
+
+    def check(self) -> None:
+        """Refuse what cannot be used with an InputError that names the field."""
+        self.calibration.check()
+        if self.name is not None and not _NAME.fullmatch(self.name):
+            raise InputError("name", "must be 1 to 64 letters, digits, '-' or '_'")
+        if self.mode not in MODES:
+            raise InputError("mode", f"must be one of {', '.join(MODES)}, got {self.mode[:40]!r}")
+        if not 0 <= self.seed < _MAX_SEED:
+            raise InputError("seed", f"must be 0 to {_MAX_SEED - 1}, got {self.seed}")
+
+    def T_world_first(self) -> np.ndarray:
+        """The pose of the first frame, [4, 4]."""
+        if self.T_map_first is None:
+            return np.eye(4)
+        try:
+            return self.T_map_first.matrix()
+        except InputError as error:
+            raise InputError(f"T_map_first.{error.field}", error.reason) from None
+
+
+@dataclass
+class Sessions:
+    """Sessions by name; those of another time are found on the mappers' disks."""
+
+    fabric: Fabric
+    _open: dict[str, Session] = field(default_factory=dict)
+    _opening: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    async def create(self, request: CreateRequest) -> Session:
+        """A new session on the mapper that has the fewest of ours.
+
+        Raises:
+            InputError: a field cannot be used.
+            ConflictError: a session of that name exists.
+            UnavailableError: no mapper is there.
+        """
+        request.check()
+        name = request.name or uuid.uuid4().hex
+        open_request = OpenRequest(
+            session=name,
+            mode=request.mode,
+            seed=request.seed,
+            calibration=request.calibration,
+            T_world_first=request.T_world_first(),
+        )
+        async with self._opening:
+            if name in self._open or await self._mapper_of(name) is not None:
+                raise ConflictError(f"session {name} exists")
+            opened = await ask_open(self.fabric, self._mapper_for(name), open_request)
+            self._open[name] = session = Session(self.fabric, opened)
+        return session
+
+    async def get(self, name: str) -> Session:
+        """An open session, or one taken up again from a mapper's disk.
+
+        Raises:
+            NotFoundError: there is no such session.
+        """
+        if name in self._open:
+            return self._open[name]
+        async with self._opening:
+            if name not in self._open:
+                mapper = await self._mapper_of(name)
+                if mapper is None:
+                    raise NotFoundError(f"no session {name[:64]!r}")
+                opened = await ask_open(self.fabric, mapper, OpenRequest(name, "offline"))
+                self._open[name] = Session(self.fabric, opened)
+        return self._open[name]
+
+    async def list(self) -> list[dict[str, Any]]:
+        """Every session on the live mappers, newest first."""
+        found: dict[str, dict[str, Any]] = {}
+        for mapper in sorted(self.fabric.mappers.names):
+            for summary in (await self._list_of(mapper)).sessions:
+                row = codec.to_json(summary) | {"mapper": mapper}
+                if summary.session not in found or summary.is_open:
+                    found[summary.session] = row
+        return sorted(found.values(), key=lambda row: -row["created_ns"])
+
+    async def delete(self, name: str) -> None:
+        """Remove a session and every byte of it.
+
+        Raises:
+            NotFoundError: there is no such session.
+        """
+        session = self._open.get(name)
+        mapper = session.owner.mapper if session else await self._mapper_of(name)
+        if mapper is None:
+            raise NotFoundError(f"no session {name[:64]!r}")
+        timeout_s = self.fabric.config.mapping.question_timeout_s
+        key = Keys.mapper(mapper, "delete")
+        await self.fabric.bus.ask(key, DeleteRequest(name), Empty, timeout_s)
+        if self._open.pop(name, None) is not None and session is not None:
+            session.close()
+
+    async def info(self, session: Session) -> dict[str, Any]:
+        """The map's state with the tracking side's under `tracking`, as plain JSON values."""
+        timeout_s = self.fabric.config.mapping.question_timeout_s
+        info: MapInfo = await session.owner.ask("info", Empty(), MapInfo, timeout_s)
+        tracking = session.state() | {"credit": self.fabric.config.stream.credit}
+        return codec.to_json(info) | {"created_ns": session.created_ns, "tracking": tracking}
+
+    def is_ready(self) -> bool:
+        """Whether a new session could be created and tracked."""
+        return bool(self.fabric.mappers.names and self.fabric.trackers.count())
+
+    async def close(self) -> None:
+        """Let every session finish what it has in flight, then stop serving it."""
+        drain_s = self.fabric.config.drain_s
+        sessions = list(self._open.values())
+        if sessions:
+            await asyncio.wait(
+                [asyncio.create_task(session.flush(drain_s)) for session in sessions],
+                timeout=drain_s,
+            )
+        for session in sessions:
+            session.close()
+        self._open.clear()
+
+    def _mapper_for(self, name: str) -> str:
+        loads = dict.fromkeys(self.fabric.mappers.names, 0)
+        if not loads:
+            raise UnavailableError("no mapper is alive")
+        for session in self._open.values():
+            if session.owner.mapper in loads:
+                loads[session.owner.mapper] += 1
+        return choose(name, loads, self.fabric.config.dispatch.load_cap)
+
+    async def _mapper_of(self, name: str) -> str | None:
+        for mapper in sorted(self.fabric.mappers.names):
+            summaries = (await self._list_of(mapper)).sessions
+            if any(summary.session == name for summary in summaries):
+                return mapper
+        return None
+
+    async def _list_of(self, mapper: str) -> SessionList:
+        timeout_s = self.fabric.config.mapping.question_timeout_s
+        key = Keys.mapper(mapper, "list")
+        try:
+            return await self.fabric.bus.ask(key, Empty(), SessionList, timeout_s)
+        except PointSlamError:
+            if mapper in self.fabric.mappers.names:
+                raise
+            return SessionList(())  # it went away while it was asked

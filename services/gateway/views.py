@@ -1,0 +1,86 @@
+"""Render requests from a query string, and rendered views as files."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared import codec, images
+from shared.camera import Intrinsics
+from shared.errors import InputError
+from shared.maps import RenderReply, RenderRequest
+from shared.se3 import Pose, Quaternion, Vector3
+
+DEPTH_SCALE = 1000.0  # units per metre of a depth PNG
+MEDIA_TYPES = {"jpeg": "image/jpeg", "png": "image/png", "msgpack": "application/msgpack"}
+WHATS = ("colour", "depth")
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a render is wanted, and as which file."""
+
+    request: RenderRequest
+    what: str
+    format: str
+
+    def check(self, max_pixels: int) -> None:
+        """Refuse what cannot be rendered with an InputError that names the field."""
+        size = self.request.intrinsics
+        size.check("intrinsics")
+        if size.width * size.height > max_pixels:
+            raise InputError("width", f"width x height must be at most {max_pixels} pixels")
+        if self.what not in WHATS:
+            raise InputError("what", f"must be one of {', '.join(WHATS)}")
+        if self.format not in MEDIA_TYPES:
+            raise InputError("format", f"must be one of {', '.join(MEDIA_TYPES)}")
+        if self.what == "depth" and self.format == "jpeg":
+            raise InputError("format", "depth comes as png or msgpack")
+
+    def etag(self, revision: int) -> str:
+        """A strong entity tag: the map's revision and this view."""
+        content = codec.pack(self.request) + f"{self.what} {self.format}".encode()
+        return f'"{revision}-{hashlib.blake2b(content, digest_size=12).hexdigest()}"'
+
+    def encode(self, reply: RenderReply) -> bytes:
+        """The file."""
+        if self.format == "msgpack":
+            return codec.pack(reply)
+        if self.what == "depth":
+            return images.encode_png(_millimetres(reply.depth_m))
+        if self.format == "png":
+            return images.encode_png(reply.rgb)
+        return images.encode_jpeg(reply.rgb).bytes
+
+
+def _millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    return np.clip(np.rint(depth_m * DEPTH_SCALE), 0, 65534).astype(np.uint16)
+
+
+def pose_from(values: dict[str, float]) -> NDArray[np.float64]:
+    """T_map_camera from px, py, pz, qx, qy, qz, qw.
+
+    Raises:
+        InputError: a value is not finite, or the quaternion has no length.
+    """
+    position = Vector3(values["px"], values["py"], values["pz"])
+    orientation = Quaternion(values["qx"], values["qy"], values["qz"], values["qw"])
+    return Pose(position, orientation).matrix()
+
+
+def intrinsics_from(
+    lens: dict[str, float | None], width: int | None, height: int | None, camera: Intrinsics
+) -> Intrinsics:
+    """The session's colour camera, with what is given put in.
+
+    A size without `fx` scales the camera to it.
+    """
+    if lens["fx"] is None and (width or height):
+        camera = camera.scaled(width / camera.width if width else (height or 0) / camera.height)
+    given = {name: value for name, value in lens.items() if value is not None}
+    sizes = {"width": width or camera.width, "height": height or camera.height}
+    return dataclasses.replace(camera, **given, **sizes)
