@@ -1,0 +1,157 @@
+"""The CPU rasterizer: Numba kernels on our own threads, inside one autograd function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from services.mapping.rasterizer.binning import bin_gaussians
+from services.mapping.rasterizer.kernel_types import (
+    CHUNK,
+    RECORD,
+    Camera,
+    Projected,
+    Splats,
+    TileLists,
+)
+from services.mapping.rasterizer.projection import project
+from services.mapping.rasterizer.projection_backward import Gradients, project_backward
+from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
+from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.threads import Workers, default_threads, workers
+from services.mapping.rasterizer.tiles_backward import blend_tiles_backward
+from services.mapping.rasterizer.tiles_forward import Images, blend_tiles
+
+
+class CpuRasterizer:
+    """Renders Gaussians on the CPU; results do not depend on the number of threads.
+
+    Several Python threads may use one rasterizer at the same time.
+    """
+
+    def __init__(self, threads: int | None = None) -> None:
+        self._engine = _Engine(workers(threads or default_threads()), Scratch())
+
+    def __call__(self, gaussians: Gaussians, view: View) -> Rendered:
+        """Render the Gaussians; see `scene` for the definition.
+
+        Raises:
+            InputError: a tensor has a wrong shape or type, or is not finite.
+        """
+        gaussians.check()
+        frame = self._engine.prepare(gaussians, view)
+        screen = ScreenStatistics(torch.from_numpy(np.diff(frame.lists.starts) > 0))
+        pass_ = _Pass(self._engine, frame, screen)
+        images = _Rasterize.apply(*gaussians.tensors(), view.pose(), pass_)
+        return Rendered(*images, screen=screen)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Gaussians projected to one view and sorted into its tiles."""
+
+    splats: Splats
+    camera: Camera
+    projected: Projected
+    lists: TileLists
+
+
+@dataclass(frozen=True)
+class _Engine:
+    """Runs the kernels of a frame, in order."""
+
+    pool: Workers
+    scratch: Scratch
+
+    def prepare(self, gaussians: Gaussians, view: View) -> _Frame:
+        camera = Camera.of(view)
+        splats = Splats(*(_flat(tensor) for tensor in gaussians.tensors()))
+        projected = Projected.empty(len(splats.opacities))
+        self.pool.run(project, splats, camera, projected)
+        if not projected.valid.all():
+            gaussians.check_finite()
+        return _Frame(splats, camera, projected, bin_gaussians(projected, camera, self.pool))
+
+    def blend(self, frame: _Frame) -> tuple[Tensor, Tensor, Tensor]:
+        size = frame.camera.height, frame.camera.width
+        images = torch.empty(*size, 3), torch.empty(size), torch.empty(size)
+        records = frame.projected.records
+        self.pool.run(blend_tiles, records, frame.lists, frame.camera, _images(images))
+        return images
+
+    def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
+        lists, records = frame.lists, frame.projected.records
+        result = _empty_gradients(len(frame.splats.opacities))
+        with self.scratch.borrow(len(lists.slots) * RECORD) as sums:
+            self.pool.run(
+                blend_tiles_backward, records, lists, frame.camera, images, gradients, sums
+            )
+            pairs = lists.starts, lists.slots, lists.ranks, sums
+            self.pool.run(project_backward, frame.splats, frame.camera, records, pairs, result)
+        return result
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """One forward pass, and where its backward pass leaves the statistics."""
+
+    engine: _Engine
+    frame: _Frame
+    screen: ScreenStatistics
+
+
+class _Rasterize(torch.autograd.Function):
+    """(means, scales, quats, opacities, colours, pose) -> (colour, depth, alpha)."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        *_, pose, ctx.run = inputs
+        ctx.pose = pose.dtype, pose.device
+        images = ctx.run.engine.blend(ctx.run.frame)
+        ctx.save_for_backward(*images)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        images = _images(ctx.saved_tensors)
+        result = ctx.run.engine.differentiate(ctx.run.frame, images, _images(gradients))
+        ctx.run.screen.gradient_norm = torch.from_numpy(result.screen)
+        fields = (
+            torch.from_numpy(array.reshape(shape))
+            for array, shape in zip(result[:5], _SHAPES, strict=True)
+        )
+        return *fields, _pose_gradient(result.poses, *ctx.pose), None
+
+
+_SHAPES = (-1, 3), (-1, 3), (-1, 4), (-1,), (-1, 3)
+
+
+def _flat(tensor: Tensor) -> NDArray[np.float32]:
+    """The tensor as an array of one axis; its own memory where it is contiguous."""
+    return tensor.detach().contiguous().numpy().reshape(-1)
+
+
+def _images(tensors: tuple[Tensor, ...]) -> Images:
+    return Images(*(_flat(tensor) for tensor in tensors))
+
+
+def _empty_gradients(count: int) -> Gradients:
+    sizes = count * 3, count * 3, count * 4, count, count * 3, count
+    arrays = (np.empty(size, np.float32) for size in sizes)
+    return Gradients(*arrays, poses=np.empty((-(-count // CHUNK), 96), np.float32))
+
+
+def _pose_gradient(poses: NDArray[np.float32], dtype: torch.dtype, device: Any) -> Tensor:
+    """Sum over chunks and lanes to dL/dT_camera_world, [4, 4]."""
+    gradient = np.zeros((4, 4))
+    gradient[:3] = poses.reshape(-1, 12, 8).sum(axis=(0, 2), dtype=np.float64).reshape(3, 4)
+    return torch.from_numpy(gradient).to(device, dtype)
