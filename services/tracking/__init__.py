@@ -1,0 +1,1 @@
+"""Tracking service: RGB-D frames in, camera poses and keyframes out."""

@@ -1,0 +1,168 @@
+"""Local bundle adjustment: poses and landmarks of a window, by Levenberg-Marquardt.
+
+Paper Eq. 2 over the window, with depth as a third residual (the depth prior) and a Huber kernel.
+Landmarks are eliminated by the Schur complement. Each free pose has a prior whose information is
+what the geometry knows of it: exact depth must not be spoilt by features good to a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.bundle_kernels import (
+    back_substitute,
+    eliminate_landmarks,
+    huber_cost,
+    linearise,
+)
+from services.tracking.config import BundleAdjustmentConfig
+from shared.camera import Intrinsics
+from shared.se3 import exp, inverse, log
+
+_MAX_DAMPING = 1e6
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Poses, landmarks and what was seen; observations are in ascending order of the landmark."""
+
+    T_world_cameras: NDArray[np.float64]  # [K, 4, 4]
+    is_fixed: NDArray[np.bool_]  # [K]
+    T_world_priors: NDArray[np.float64]  # [K, 4, 4], where geometry holds the cameras
+    pose_information: NDArray[np.float64]  # [K, 6, 6], how firmly, of a camera twist from there
+    points_world: NDArray[np.float64]  # [L, 3]
+    camera_index: NDArray[np.int64]  # [O]
+    point_index: NDArray[np.int64]  # [O], ascending
+    measured: NDArray[np.float64]  # [O, 3], u and v in pixels, depth in metres (0: none)
+    sigmas: NDArray[np.float64]  # [O, 2], of the pixels and of the depth
+
+
+@dataclass(frozen=True)
+class BundleSolution:
+    """Poses and landmarks at the minimum."""
+
+    T_world_cameras: NDArray[np.float64]  # [K, 4, 4]
+    points_world: NDArray[np.float64]  # [L, 3]
+    cost_before: float
+    cost_after: float
+
+
+def solve_bundle(
+    problem: BundleProblem, intrinsics: Intrinsics, config: BundleAdjustmentConfig
+) -> BundleSolution:
+    """Minimise; a solution is never worse than the start."""
+    solver = _Solver(problem, intrinsics, config)
+    state = _State(problem.T_world_cameras, problem.points_world)
+    start = cost = solver.cost(state)
+    damping = 1e-4
+    for _ in range(config.iterations):
+        system = solver.linearise(state)
+        candidate, damping, candidate_cost = solver.descend(system, state, cost, damping)
+        if candidate_cost >= cost * (1.0 - 1e-5):
+            break
+        state, cost = candidate, candidate_cost
+    return BundleSolution(state.T_world_cameras, state.points_world, start, cost)
+
+
+@dataclass(frozen=True)
+class _State:
+    T_world_cameras: NDArray[np.float64]
+    points_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _System:
+    Hcc: NDArray[np.float64]  # [K, 6, 6]
+    Hpp: NDArray[np.float64]  # [L, 3, 3]
+    Hcp: NDArray[np.float64]  # [O, 6, 3]
+    bc: NDArray[np.float64]  # [K, 6]
+    bp: NDArray[np.float64]  # [L, 3]
+
+
+class _Solver:
+    """The parts of the problem that do not change from step to step."""
+
+    def __init__(
+        self, problem: BundleProblem, intrinsics: Intrinsics, config: BundleAdjustmentConfig
+    ) -> None:
+        assert (np.diff(problem.point_index) >= 0).all()
+        self._problem = problem
+        self._huber = config.huber_sigma
+        self._camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+        landmarks = np.arange(len(problem.points_world) + 1)
+        self._starts = np.searchsorted(problem.point_index, landmarks).astype(np.int64)
+        self._free = np.flatnonzero(np.repeat(~problem.is_fixed, 6))
+
+    def cost(self, state: _State) -> float:
+        p = self._problem
+        views = inverse(state.T_world_cameras)
+        features = huber_cost(
+            views,
+            state.points_world,
+            p.camera_index,
+            p.point_index,
+            p.measured,
+            p.sigmas,
+            self._camera,
+            self._huber,
+        )
+        steps = self._steps(state)
+        return features + float(np.einsum("ki,kij,kj->", steps, p.pose_information, steps))
+
+    def _steps(self, state: _State) -> NDArray[np.float64]:
+        start = inverse(self._problem.T_world_priors)
+        return np.array([log(a @ b) for a, b in zip(start, state.T_world_cameras, strict=True)])
+
+    def linearise(self, state: _State) -> _System:
+        p = self._problem
+        Hcc, Hpp, Hcp, bc, bp = linearise(
+            inverse(state.T_world_cameras),
+            state.points_world,
+            p.camera_index,
+            p.point_index,
+            p.measured,
+            p.sigmas,
+            self._camera,
+            self._huber,
+        )
+        pull = np.einsum("kij,kj->ki", p.pose_information, self._steps(state))
+        return _System(Hcc + p.pose_information, Hpp, Hcp, bc + pull, bp)
+
+    def descend(
+        self, system: _System, state: _State, cost: float, damping: float
+    ) -> tuple[_State, float, float]:
+        """The first step that lowers the cost, with the damping for the next one."""
+        while damping <= _MAX_DAMPING:
+            candidate = self._step(system, state, damping)
+            candidate_cost = self.cost(candidate)
+            if candidate_cost < cost:
+                return candidate, max(0.2 * damping, 1e-9), candidate_cost
+            damping *= 8.0
+        return state, damping, cost
+
+    def _step(self, system: _System, state: _State, damping: float) -> _State:
+        p = self._problem
+        S, b, Hpp_inverse = eliminate_landmarks(
+            system.Hcc,
+            system.Hpp,
+            system.Hcp,
+            system.bc,
+            system.bp,
+            p.camera_index,
+            self._starts,
+            damping,
+        )
+        twists = np.zeros(6 * len(p.is_fixed))
+        if len(self._free):
+            reduced = S[np.ix_(self._free, self._free)]
+            twists[self._free] = -np.linalg.solve(reduced, b[self._free])
+        moves = back_substitute(
+            Hpp_inverse, system.Hcp, system.bp, p.camera_index, self._starts, twists
+        )
+        poses = [
+            T @ exp(t) for T, t in zip(state.T_world_cameras, twists.reshape(-1, 6), strict=True)
+        ]
+        return _State(np.array(poses), state.points_world + moves)

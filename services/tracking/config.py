@@ -1,0 +1,177 @@
+"""The numbers of tracking, by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from shared.errors import ConfigError
+
+
+def _require_positive(config: object, *names: str) -> None:
+    for name in names:
+        if getattr(config, name) <= 0:
+            raise ConfigError(f"{name} must be positive, got {getattr(config, name)}")
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Points and normals from the depth grid."""
+
+    stride_px: int = 4  # between samples at 640x480; grows with the image
+    window_radius_px: int = 6  # of the plane fit, at 640x480
+    min_depth_m: float = 0.2
+    max_depth_m: float = 8.0  # far surfaces hold the rotation: 4 m was measured to cost it
+    min_window_share: float = 0.5  # of the window's pixels that lie on the surface
+    min_incidence_cos: float = 0.17  # 80 degrees
+    max_slope: float = 4.0  # of a surface within the window; a steeper step is an edge
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "stride_px", "window_radius_px", "min_depth_m")
+        if self.max_depth_m <= self.min_depth_m:
+            raise ConfigError(f"max_depth_m must exceed min_depth_m, got {self.max_depth_m}")
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Coarse-to-fine point-to-plane registration to the local map."""
+
+    voxel_sizes_m: tuple[float, ...] = (0.20, 0.10, 0.05)
+    sample_steps: tuple[int, ...] = (4, 2, 1)
+    max_iterations: tuple[int, ...] = (8, 8, 12)
+    min_normal_cos: float = 0.7
+    depth_sigma_floor_m: float = 0.002
+    depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
+    kernel_width: float = 2.0  # of the robust kernel, in residual scales
+    translation_tolerance_m: float = 5e-5
+    rotation_tolerance_rad: float = 5e-5
+    min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
+    effective_share: float = 0.02  # residuals of neighbours are not independent
+    model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.voxel_sizes_m), len(self.sample_steps), len(self.max_iterations)}
+        if len(lengths) != 1 or not self.voxel_sizes_m:
+            raise ConfigError("voxel_sizes_m, sample_steps and max_iterations must match in length")
+        _require_positive(self, "depth_sigma_floor_m", "kernel_width", "effective_share")
+
+
+@dataclass(frozen=True)
+class OrbConfig:
+    """Features and their matching to landmarks."""
+
+    num_features: int = 1000
+    num_detected: int = 2500  # before they are spread over cells
+    cell_px: int = 40
+    fast_threshold: int = 8
+    num_levels: int = 8
+    search_radius_px: float = 10.0
+    max_hamming_bits: int = 60
+    ratio: float = 0.85
+    max_hamming_bits_global: int = 64  # matching without a pose
+    ratio_global: float = 0.8
+    max_depth_spread: float = 0.03  # relative, around a keypoint whose depth is trusted
+    max_feature_depth_m: float = 8.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "num_features", "num_detected", "cell_px", "search_radius_px")
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Pose-only refinement on features, with the registration as prior."""
+
+    pixel_sigma: float = 1.5  # at octave 0
+    depth_sigma_floor_m: float = 0.005
+    depth_sigma_per_m2: float = 0.004
+    huber_sigma: float = 2.0
+    rounds: int = 3
+    iterations: int = 5
+    outlier_chi2: float = 9.0
+    min_observations: int = 10
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "pixel_sigma", "huber_sigma", "rounds", "iterations")
+
+
+@dataclass(frozen=True)
+class VerificationConfig:
+    """When a pose is believed."""
+
+    sure_inliers: int = 40  # enough of both and nothing else is tried
+    sure_agreement: float = 0.85
+    min_inliers: int = 15
+    min_inlier_share: float = 0.25
+    min_agreement: float = 0.6
+    min_overlap: float = 0.15
+    depth_tolerance_m: float = 0.03
+    depth_tolerance_per_m2: float = 0.01
+    coarse_min_agreement: float = 0.85  # without features
+    coarse_min_overlap: float = 0.5
+    max_step_m: float = 1.0
+    max_step_deg: float = 50.0
+
+
+@dataclass(frozen=True)
+class RelocalizationConfig:
+    """Pose from features alone."""
+
+    min_matches: int = 12
+    min_inliers: int = 10
+    reprojection_px: float = 4.0
+    iterations: int = 2000
+    max_candidates: int = 5
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class KeyframeRuleConfig:
+    """When a frame becomes a keyframe."""
+
+    min_overlap: float = 0.75  # of its surface with the local map
+    max_interval: int = 10  # frames, for mapping
+    min_landmark_share: float = 0.35  # of its features with depth that match a landmark
+    max_cloud_points: int = 12000
+    min_points: int = 500  # of a map's first keyframe
+    min_step_m: float = 0.02  # from the reference keyframe: less is the same view again
+    min_turn_deg: float = 1.0
+    max_turn_deg: float = 15.0
+    max_step_share: float = 0.12  # of the median depth
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "max_interval", "max_cloud_points")
+
+
+@dataclass(frozen=True)
+class BundleAdjustmentConfig:
+    """Local bundle adjustment of a new keyframe's window."""
+
+    iterations: int = 8
+    pixel_sigma: float = 1.5
+    huber_sigma: float = 2.0
+    outlier_chi2: float = 16.0
+    depth_sigma_floor_m: float = 0.003
+    depth_sigma_per_m2: float = 0.003
+    pose_prior_share: float = 1.0  # weight of the geometry that holds a window's poses
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "pixel_sigma", "huber_sigma", "iterations")
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """All of the tracking service."""
+
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    orb: OrbConfig = field(default_factory=OrbConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    keyframe: KeyframeRuleConfig = field(default_factory=KeyframeRuleConfig)
+    bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    context_cache: int = 8  # contexts kept, over all sessions
+    concurrent_frames: int = 2
+    query_timeout_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "context_cache", "concurrent_frames", "query_timeout_s")

@@ -1,0 +1,130 @@
+"""When a frame becomes a keyframe, and what it then brings to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import KeyframeRuleConfig
+from services.tracking.orb import Features
+from services.tracking.point_cloud import normals_at
+from services.tracking.config import SurfaceConfig
+from shared.frames import Frame, Prior
+from shared.rectify import RgbdImage
+from shared.se3 import angle_rad, inverse
+from shared.tracks import (
+    NO_LANDMARK,
+    Correction,
+    KeyframeData,
+    Observations,
+    PointCloud,
+    landmark_id,
+)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How well the map around already shows what a frame sees."""
+
+    overlap: float  # share of the frame's surface that the map has
+    landmark_share: float  # share of its features with depth that are landmarks
+    T_reference_camera: NDArray[np.float64]  # [4, 4]
+    median_depth_m: float
+
+
+def becomes_keyframe(
+    frame: Frame, prior: Prior, coverage: Coverage, config: KeyframeRuleConfig
+) -> bool:
+    """GS-ICP's overlap and interval rules and ORB-SLAM's feature rule; never a repeated view."""
+    step_m = float(np.linalg.norm(coverage.T_reference_camera[:3, 3]))
+    turn_deg = float(np.degrees(angle_rad(coverage.T_reference_camera)))
+    moved = step_m > config.min_step_m or turn_deg > config.min_turn_deg
+    if not (frame.may_be_keyframe and moved):
+        return False
+    return (
+        coverage.overlap < config.min_overlap
+        or coverage.landmark_share < config.min_landmark_share
+        or prior.frames_since_keyframe + 1 >= config.max_interval
+        or turn_deg > config.max_turn_deg
+        or step_m > config.max_step_share * coverage.median_depth_m
+    )
+
+
+def keyframe_observations(
+    seq: int, features: Features, landmark_ids: NDArray[np.int64]
+) -> Observations:
+    """All features of a keyframe; those with depth and no landmark yet found a new one.
+
+    Args:
+        seq: of the keyframe.
+        features: all of the frame.
+        landmark_ids: of the matched ones, NO_LANDMARK elsewhere, [M].
+    """
+    founds = (landmark_ids == NO_LANDMARK) & (features.depths_m > 0.0)
+    own = landmark_id(seq, np.arange(len(landmark_ids), dtype=np.int64))
+    return Observations(
+        landmark_ids=np.where(founds, own, landmark_ids),
+        keypoints_px=features.keypoints_px,
+        octaves=features.octaves,
+        depths_m=features.depths_m,
+        descriptors=features.descriptors,
+    )
+
+
+@dataclass(frozen=True)
+class KeyframeParts:
+    """What a keyframe is made of."""
+
+    image: RgbdImage
+    cloud_camera: PointCloud
+    observations: Observations
+    correction: Correction
+
+
+def keyframe_data(
+    parts: KeyframeParts, surface: SurfaceConfig, config: KeyframeRuleConfig
+) -> KeyframeData:
+    """Normals, the thinned cloud and the thumbnail beside the observations."""
+    image = parts.image
+    return KeyframeData(
+        observations=parts.observations,
+        landmark_normals_camera=normals_at(
+            image.depth_m, parts.observations.keypoints_px, image.intrinsics, surface
+        ),
+        cloud_camera=thinned(parts.cloud_camera, config.max_cloud_points),
+        thumbnail=thumbnail_of(image.rgb),
+        correction=parts.correction,
+    )
+
+
+def thinned(cloud: PointCloud, limit: int) -> PointCloud:
+    """At most `limit` points, evenly from the whole image."""
+    if len(cloud.points) <= limit:
+        return cloud
+    rows = np.linspace(0, len(cloud.points) - 1, limit).astype(np.int64)
+    return PointCloud(cloud.points[rows], cloud.normals[rows])
+
+
+def thumbnail_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey image of 20x15 pixels, [15, 20]."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return cv2.resize(grey, (20, 15), interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def nearest_reference(
+    T_world_camera: NDArray[np.float64],
+    present: tuple[int, NDArray[np.float64]],
+    others: list[tuple[int, NDArray[np.float64]]],
+    depth_m: float,
+) -> tuple[int, NDArray[np.float64]]:
+    """The keyframe to tell a pose relative to: the present one unless another is much nearer."""
+
+    def distance(keyframe: tuple[int, NDArray[np.float64]]) -> float:
+        step = inverse(keyframe[1]) @ T_world_camera
+        return float(np.linalg.norm(step[:3, 3])) + depth_m * angle_rad(step)
+
+    best = min(others, key=distance, default=present)
+    return best if distance(best) < 0.6 * distance(present) else present

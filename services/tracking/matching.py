@@ -1,0 +1,190 @@
+"""Features to landmarks: by projection where a pose is known, by descriptor alone where not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import OrbConfig
+from services.tracking.orb import Features
+from shared.camera import Intrinsics
+from shared.se3 import inverse
+from shared.tracks import Landmarks
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Pairs of a feature and a landmark; each feature and each landmark at most once."""
+
+    features: NDArray[np.int64]  # [P], rows of the features
+    landmarks: NDArray[np.int64]  # [P], rows of the landmarks
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def where(self, keep: NDArray[np.bool_]) -> Matches:
+        """Some of the pairs."""
+        return Matches(self.features[keep], self.landmarks[keep])
+
+
+def match_by_projection(
+    features: Features,
+    landmarks: Landmarks,
+    T_world_camera: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    config: OrbConfig,
+) -> Matches:
+    """Look for each landmark around the pixel where the pose puts it, at about its scale."""
+    if len(features.octaves) == 0 or len(landmarks.ids) == 0:
+        return _no_matches()
+    i = intrinsics
+    best, distances = _search(
+        landmarks.positions_world,
+        landmarks.normals_world,
+        _words(landmarks.descriptors),
+        landmarks.octaves,
+        landmarks.distances_m,
+        inverse(T_world_camera),
+        np.array([i.fx, i.fy, i.cx, i.cy]),
+        _grid(features.keypoints_px, i),
+        features.keypoints_px,
+        features.octaves,
+        _words(features.descriptors),
+        np.array([config.search_radius_px, config.max_hamming_bits, config.ratio]),
+    )
+    return _one_to_one(best, distances, len(features.octaves))
+
+
+def match_by_descriptor(features: Features, landmarks: Landmarks, config: OrbConfig) -> Matches:
+    """Nearest descriptors both ways, distinct from the second nearest."""
+    if len(features.octaves) < 2 or len(landmarks.ids) < 2:
+        return _no_matches()
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    forward = matcher.knnMatch(features.descriptors, landmarks.descriptors, k=2)
+    pairs = [
+        (a.queryIdx, a.trainIdx, int(a.distance))
+        for a, b in forward
+        if a.distance <= config.max_hamming_bits_global
+        and a.distance < config.ratio_global * b.distance
+    ]
+    best = np.full(len(landmarks.ids), -1, np.int64)
+    distances = np.full(len(landmarks.ids), 257, np.int64)
+    for feature, landmark, distance in pairs:
+        if distance < distances[landmark]:
+            best[landmark], distances[landmark] = feature, distance
+    return _one_to_one(best, distances, len(features.octaves))
+
+
+def _no_matches() -> Matches:
+    return Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
+
+
+_CELL_PX = 16
+
+
+def _grid(pixels: NDArray[np.float32], intrinsics: Intrinsics) -> tuple[NDArray, NDArray, int]:
+    """Features by cell: starts [cells + 1], rows in cell order, cells a row of the image."""
+    columns = intrinsics.width // _CELL_PX + 1
+    rows = intrinsics.height // _CELL_PX + 1
+    cells = np.floor(pixels / _CELL_PX).astype(np.int64)
+    cell = np.clip(cells[:, 1], 0, rows - 1) * columns + np.clip(cells[:, 0], 0, columns - 1)
+    order = np.argsort(cell, kind="stable")
+    return np.searchsorted(cell[order], np.arange(rows * columns + 1)), order, columns
+
+
+def _one_to_one(
+    best: NDArray[np.int64], distances: NDArray[np.int64], num_features: int
+) -> Matches:
+    """Of the landmarks that want the same feature, the nearest descriptor gets it."""
+    wanting = np.flatnonzero(best >= 0)
+    order = wanting[np.argsort(distances[wanting], kind="stable")]
+    _, first = np.unique(best[order], return_index=True)
+    landmarks = np.sort(order[first])
+    return Matches(best[landmarks], landmarks)
+
+
+@numba.njit(cache=True, nogil=True)
+def _search(
+    positions,
+    normals,
+    words,
+    octaves,
+    distances,
+    T_camera_world,
+    camera,
+    grid,
+    pixels,
+    feature_octaves,
+    feature_words,
+    limits,
+):  # pragma: no cover - compiled
+    starts, order, columns = grid
+    rows = (len(starts) - 1) // columns
+    count = len(positions)
+    best = np.full(count, -1, np.int64)
+    bits = np.full(count, 257, np.int64)
+    R = T_camera_world
+    for n in range(count):
+        X = positions[n]
+        x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + R[0, 3]
+        y = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + R[1, 3]
+        z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + R[2, 3]
+        if z < 0.05:
+            continue
+        u = camera[0] * x / z + camera[2]
+        v = camera[1] * y / z + camera[3]
+        length = np.sqrt(x * x + y * y + z * z)
+        # Seen from behind, or at a scale that the pyramid does not reach: not the same patch.
+        w = normals[n]
+        nx = R[0, 0] * w[0] + R[0, 1] * w[1] + R[0, 2] * w[2]
+        ny = R[1, 0] * w[0] + R[1, 1] * w[1] + R[1, 2] * w[2]
+        nz = R[2, 0] * w[0] + R[2, 1] * w[1] + R[2, 2] * w[2]
+        if nx * x + ny * y + nz * z > 0.1 * length:
+            continue
+        level = octaves[n] + np.log(max(distances[n], 0.05) / length) / np.log(1.2)
+        radius = limits[0] * 1.2 ** min(max(level, 0.0), 4.0)
+        c0 = max(int((u - radius) // 16), 0)
+        c1 = min(int((u + radius) // 16), columns - 1)
+        r0 = max(int((v - radius) // 16), 0)
+        r1 = min(int((v + radius) // 16), rows - 1)
+        nearest, second, row_best, octave_best, octave_second = 257, 257, -1, -1, -2
+        for r in range(r0, r1 + 1):
+            for c in range(c0, c1 + 1):
+                for s in range(starts[r * columns + c], starts[r * columns + c + 1]):
+                    f = order[s]
+                    if (pixels[f, 0] - u) ** 2 + (pixels[f, 1] - v) ** 2 > radius * radius:
+                        continue
+                    if abs(feature_octaves[f] - level) > 1.6:
+                        continue
+                    d = 0
+                    for k in range(4):
+                        d += popcount(words[n, k] ^ feature_words[f, k])
+                    if d < nearest:
+                        second, octave_second = nearest, octave_best
+                        nearest, row_best, octave_best = d, f, feature_octaves[f]
+                    elif d < second:
+                        second, octave_second = d, feature_octaves[f]
+        if nearest > limits[1]:
+            continue
+        if octave_best == octave_second and nearest > limits[2] * second:
+            continue
+        best[n] = row_best
+        bits[n] = nearest
+    return best, bits
+
+
+@numba.njit(cache=True, nogil=True)
+def popcount(x):  # pragma: no cover - compiled
+    """Number of ones in a 64 bit word."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))

@@ -1,0 +1,108 @@
+"""ORB features spread over the image, with depth where it can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import OrbConfig
+from shared.camera import Intrinsics
+from shared.rectify import RgbdImage
+
+
+@dataclass(frozen=True)
+class Features:
+    """ORB features of one image, best first."""
+
+    keypoints_px: NDArray[np.float32]  # [M, 2]
+    octaves: NDArray[np.uint8]  # [M]
+    descriptors: NDArray[np.uint8]  # [M, 32]
+    depths_m: NDArray[np.float32]  # [M], 0 where none is reliable
+
+    def points_camera(self, intrinsics: Intrinsics) -> NDArray[np.float64]:
+        """Keypoints lifted by their depth, [M, 3]; zero where there is none."""
+        return backproject(self.keypoints_px, self.depths_m, intrinsics)
+
+
+def backproject(
+    keypoints_px: NDArray[np.float32], depths_m: NDArray[np.float32], intrinsics: Intrinsics
+) -> NDArray[np.float64]:
+    """Pixels [M, 2] with depth along the optical axis [M] as points of the camera frame, [M, 3]."""
+    z = depths_m.astype(np.float64)
+    x = (keypoints_px[:, 0] - intrinsics.cx) / intrinsics.fx * z
+    y = (keypoints_px[:, 1] - intrinsics.cy) / intrinsics.fy * z
+    return np.stack([x, y, z], axis=1)
+
+
+def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
+    """Detect, spread over cells, describe.
+
+    OpenCV keeps the strongest corners wherever they crowd; the pose wants them all over the image,
+    so more are detected and each cell gives its best ones in turn.
+    """
+    grey = cv2.cvtColor(image.rgb, cv2.COLOR_RGB2GRAY)
+    orb = cv2.ORB.create(
+        nfeatures=config.num_detected,
+        nlevels=config.num_levels,
+        fastThreshold=config.fast_threshold,
+    )
+    keypoints, descriptors = orb.detectAndCompute(grey, None)
+    if not keypoints:
+        return _no_features()
+    pixels = np.array([k.pt for k in keypoints], np.float32)
+    octaves = np.array([k.octave for k in keypoints], np.uint8)
+    responses = np.array([k.response for k in keypoints], np.float32)
+    chosen = spread(pixels, responses, config.cell_px, config.num_features)
+    depths = _trusted_depths(
+        image.depth_m, pixels[chosen], config.max_depth_spread, config.max_feature_depth_m
+    )
+    assert descriptors is not None
+    return Features(
+        pixels[chosen], octaves[chosen], np.ascontiguousarray(descriptors[chosen], np.uint8), depths
+    )
+
+
+def _no_features() -> Features:
+    return Features(
+        np.zeros((0, 2), np.float32),
+        np.zeros(0, np.uint8),
+        np.zeros((0, 32), np.uint8),
+        np.zeros(0, np.float32),
+    )
+
+
+def spread(
+    pixels: NDArray[np.float32], responses: NDArray[np.float32], cell_px: int, limit: int
+) -> NDArray[np.int64]:
+    """Indices of up to `limit` keypoints: the best of every cell, then the second best, ..."""
+    cells = np.floor(pixels / cell_px).astype(np.int64)
+    cell = cells[:, 1] * 4096 + cells[:, 0]
+    order = np.lexsort((np.arange(len(cell)), -responses, cell))
+    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
+    lengths = np.diff(np.r_[starts, len(order)])
+    ranks = np.arange(len(order)) - np.repeat(starts, lengths)
+    by_rank = np.lexsort((-responses[order], ranks))
+    return order[by_rank[:limit]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _trusted_depths(depth, pixels, max_spread, max_depth):  # pragma: no cover - compiled
+    """Depth at each keypoint where its 3x3 patch has enough readings that agree, else 0."""
+    height, width = depth.shape
+    out = np.zeros(len(pixels), np.float32)
+    for n in range(len(pixels)):
+        u = int(np.floor(pixels[n, 0] + 0.5))
+        v = int(np.floor(pixels[n, 1] + 0.5))
+        low, high, total, count = np.inf, 0.0, 0.0, 0
+        for vv in range(max(v - 1, 0), min(v + 2, height)):
+            for uu in range(max(u - 1, 0), min(u + 2, width)):
+                z = depth[vv, uu]
+                if z > 0.0:
+                    low, high, total, count = min(low, z), max(high, z), total + z, count + 1
+        if count >= 6 and high <= max_depth and high - low <= max_spread * low:
+            out[n] = total / count
+    return out

@@ -1,0 +1,199 @@
+"""Progressive pose optimization: one frame in, one pose out (paper, section of that name).
+
+`track` is a function of the frame, the prior and the map's answers. Nothing is remembered here:
+whichever worker gets the frame gives the same result to the bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import TrackingConfig
+from services.tracking.estimate import Estimate, Observed
+from services.tracking.keyframes import (
+    Coverage,
+    KeyframeParts,
+    becomes_keyframe,
+    keyframe_data,
+    keyframe_observations,
+    nearest_reference,
+)
+from services.tracking.local_map import LocalMap, MapSource
+from services.tracking.orb import extract_features
+from services.tracking.point_cloud import surface_from_depth
+from services.tracking.search import Found, Job, search
+from services.tracking.stopwatch import Stopwatch
+from services.tracking.window import NewKeyframe, adjust_window, first_correction
+from shared.frames import TrackingStatus, TrackRequest
+from shared.rectify import rectify
+from shared.se3 import inverse
+from shared.tracks import NO_LANDMARK, KeyframeData, TrackResult
+
+
+def track(request: TrackRequest, source: MapSource, config: TrackingConfig) -> TrackResult:
+    """Estimate the pose of one frame and, where the map needs it, make it a keyframe.
+
+    Args:
+        request: the frame with its calibration and everything known before it.
+        source: answers of the map's owner in the request's revision.
+        config: all numbers.
+
+    Raises:
+        InputError: an image cannot be decoded; names the field.
+    """
+    clock = Stopwatch()
+    observed = _observe(request, config, clock)
+    job = Job(request, observed, source, config, clock)
+    with clock.stage("context"):
+        local = source.local_map(request.prior.reference_seq if request.prior else -1)
+    if local.context.num_keyframes == 0:
+        return _begin(job)
+    found = search(job, local)
+    if found.estimate is None:
+        return _lost(job, local)
+    with clock.stage("keyframe"):
+        keyframe = _new_keyframe(job, found)
+    return _answer(job, found, keyframe)
+
+
+def _observe(request: TrackRequest, config: TrackingConfig, clock: Stopwatch) -> Observed:
+    with clock.stage("decode"):
+        image = rectify(request.frame, request.calibration)
+    with clock.stage("points"):
+        cloud = surface_from_depth(image.depth_m, image.intrinsics, config.surface)
+    with clock.stage("orb"):
+        features = extract_features(image, config.orb)
+    return Observed(image, cloud, features)
+
+
+def _begin(job: Job) -> TrackResult:
+    """The first frame of a map holds the world in place."""
+    request, observed = job.request, job.observed
+    T = request.T_world_first
+    enough = len(observed.cloud.points) >= job.config.keyframe.min_points
+    if not (request.frame.may_be_keyframe and enough):
+        return _without_pose(job, TrackingStatus.NEED_FRAMES, T, -1)
+    seq = request.frame.seq
+    none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
+    observations = keyframe_observations(seq, observed.features, none)
+    correction = first_correction(seq, T, observations, observed.image.intrinsics)
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+    return TrackResult(
+        seq=seq,
+        t_ns=request.frame.t_ns,
+        status=TrackingStatus.TRACKED,
+        T_world_camera=T,
+        covariance=np.zeros((6, 6)),
+        reference_seq=seq,
+        T_reference_camera=np.eye(4),
+        inliers=0,
+        inlier_share=0.0,
+        map_revision=request.map_revision,
+        timings_ms=job.clock.times(),
+        keyframe=keyframe_data(parts, job.config.surface, job.config.keyframe),
+    )
+
+
+def _lost(job: Job, local: LocalMap) -> TrackResult:
+    """The prior's pose again, said to be lost."""
+    prior = job.request.prior
+    if prior is None:
+        context = local.context
+        return _without_pose(
+            job, TrackingStatus.LOST, context.T_world_reference, context.reference_seq
+        )
+    return _without_pose(job, TrackingStatus.LOST, prior.T_world_camera, prior.reference_seq)
+
+
+def _without_pose(
+    job: Job, status: TrackingStatus, T: NDArray[np.float64], reference_seq: int
+) -> TrackResult:
+    frame = job.request.frame
+    return TrackResult(
+        seq=frame.seq,
+        t_ns=frame.t_ns,
+        status=status,
+        T_world_camera=T,
+        covariance=np.zeros((6, 6)),
+        reference_seq=reference_seq,
+        T_reference_camera=np.eye(4),
+        inliers=0,
+        inlier_share=0.0,
+        map_revision=job.request.map_revision,
+        timings_ms=job.clock.times(),
+    )
+
+
+def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
+    """What the frame brings to the map, or None where the map has no need of it."""
+    estimate, observed, config = found.estimate, job.observed, job.config
+    assert estimate is not None
+    frame, prior = job.request.frame, job.request.prior
+    if prior is None or found.status is TrackingStatus.RELOCALISED:
+        return None
+    if not becomes_keyframe(frame, prior, _coverage(observed, estimate), config.keyframe):
+        return None
+    ids = estimate.landmark_ids(len(observed.features.octaves))
+    observations = keyframe_observations(frame.seq, observed.features, ids)
+    new = NewKeyframe(frame.seq, estimate.T_world_camera, observations, estimate.registration)
+    with job.clock.stage("bundle_adjustment"):
+        correction = adjust_window(new, estimate.local.context, observed.image.intrinsics, config)
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+    return keyframe_data(parts, config.surface, config.keyframe)
+
+
+def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
+    with_depth = int((observed.features.depths_m > 0.0).sum())
+    T_world_reference = estimate.local.context.T_world_reference
+    return Coverage(
+        overlap=estimate.registration.overlap,
+        landmark_share=estimate.inliers / max(1, with_depth),
+        T_reference_camera=inverse(T_world_reference) @ estimate.T_world_camera,
+        median_depth_m=_median_depth(observed),
+    )
+
+
+def _median_depth(observed: Observed) -> float:
+    depths = observed.cloud.points[:, 2]
+    return float(np.median(depths)) if len(depths) else 1.0
+
+
+def _answer(job: Job, found: Found, keyframe: KeyframeData | None) -> TrackResult:
+    estimate, frame = found.estimate, job.request.frame
+    assert estimate is not None
+    T = estimate.T_world_camera
+    if keyframe is None:
+        reference_seq, T_world_reference = _reference(job, estimate)
+    else:
+        T = keyframe.correction.T_world_keyframes[-1]
+        reference_seq, T_world_reference = frame.seq, T
+    return TrackResult(
+        seq=frame.seq,
+        t_ns=frame.t_ns,
+        status=found.status,
+        T_world_camera=T,
+        covariance=_covariance(estimate.information),
+        reference_seq=reference_seq,
+        T_reference_camera=inverse(T_world_reference) @ T,
+        inliers=estimate.inliers,
+        inlier_share=estimate.inlier_share,
+        map_revision=estimate.local.context.revision,
+        timings_ms=job.clock.times(),
+        keyframe=keyframe,
+    )
+
+
+def _reference(job: Job, estimate: Estimate) -> tuple[int, NDArray[np.float64]]:
+    context = estimate.local.context
+    return nearest_reference(
+        estimate.T_world_camera,
+        (context.reference_seq, context.T_world_reference),
+        [(keyframe.seq, keyframe.T_world_camera) for keyframe in context.window],
+        _median_depth(job.observed),
+    )
+
+
+def _covariance(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of the information; what nothing is known of gets a metre or a radian."""
+    return np.linalg.inv(information + np.eye(6))

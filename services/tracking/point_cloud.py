@@ -1,0 +1,144 @@
+"""Points and normals from the depth grid: no search for neighbours, no kd-tree."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import SurfaceConfig
+from shared.camera import Intrinsics
+from shared.tracks import PointCloud
+
+_BASE_PIXELS = 640 * 480
+
+
+def surface_from_depth(
+    depth_m: NDArray[np.float32], intrinsics: Intrinsics, config: SurfaceConfig
+) -> PointCloud:
+    """Sample a depth image on a grid and fit a plane to each sample's window.
+
+    The inverse depth of a plane is linear in the pixel, and structured light measures inverse
+    depth with even noise, so the fit is a small linear one (normal of the plane and a denoised
+    point at once). Samples at edges, at grazing incidence or out of range are dropped.
+
+    Args:
+        depth_m: [H, W], 0 where there is none.
+        intrinsics: pinhole of the image.
+        config: grid, window, range.
+
+    Returns:
+        points and normals (towards the camera) in the camera frame, in rows of the grid.
+    """
+    stride, radius, camera, limits = _fit_settings(intrinsics, config)
+    points, normals = _fit_planes(depth_m, camera, stride, radius, limits)
+    return PointCloud(points, normals)
+
+
+def normals_at(
+    depth_m: NDArray[np.float32],
+    pixels: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    config: SurfaceConfig,
+) -> NDArray[np.float32]:
+    """Normals of the surface at some pixels [M, 2], camera frame, [M, 3]; zero where unknown."""
+    _, radius, camera, limits = _fit_settings(intrinsics, config)
+    return _fit_planes_at(depth_m, pixels, camera, radius, limits)
+
+
+def _fit_settings(
+    intrinsics: Intrinsics, config: SurfaceConfig
+) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
+    """Stride and window radius in pixels of this image, its camera, and the limits."""
+    scale = np.sqrt(intrinsics.width * intrinsics.height / _BASE_PIXELS)
+    stride = max(1, round(config.stride_px * scale))
+    radius = max(3, round(config.window_radius_px * scale))
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+    limits = np.array(
+        [
+            config.min_depth_m,
+            config.max_depth_m,
+            config.min_window_share,
+            config.min_incidence_cos,
+            config.max_slope,
+        ]
+    )
+    return stride, radius, camera, limits
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_planes(depth, camera, stride, radius, limits):  # pragma: no cover - compiled
+    height, width = depth.shape
+    capacity = ((height - 1) // stride + 1) * ((width - 1) // stride + 1)
+    points = np.empty((capacity, 3), np.float32)
+    normals = np.empty((capacity, 3), np.float32)
+    count = 0
+    for v in range(stride // 2, height, stride):
+        for u in range(stride // 2, width, stride):
+            inverse, nx, ny, nz = _fit_plane(depth, u, v, camera, radius, limits)
+            if inverse <= 0.0:
+                continue
+            points[count, 0] = (u - camera[2]) / camera[0] / inverse
+            points[count, 1] = (v - camera[3]) / camera[1] / inverse
+            points[count, 2] = 1.0 / inverse
+            normals[count, 0], normals[count, 1], normals[count, 2] = nx, ny, nz
+            count += 1
+    return points[:count].copy(), normals[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_planes_at(depth, pixels, camera, radius, limits):  # pragma: no cover - compiled
+    normals = np.zeros((len(pixels), 3), np.float32)
+    for n in range(len(pixels)):
+        u = min(max(int(np.floor(pixels[n, 0] + 0.5)), 0), depth.shape[1] - 1)
+        v = min(max(int(np.floor(pixels[n, 1] + 0.5)), 0), depth.shape[0] - 1)
+        inverse, nx, ny, nz = _fit_plane(depth, u, v, camera, radius, limits)
+        if inverse > 0.0:
+            normals[n, 0], normals[n, 1], normals[n, 2] = nx, ny, nz
+    return normals
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_plane(depth, u, v, camera, radius, limits):  # pragma: no cover - compiled
+    """Inverse depth (0: no plane) and unit normal at a pixel."""
+    height, width = depth.shape
+    fx, fy = camera[0], camera[1]
+    none = (0.0, 0.0, 0.0, 0.0)
+    z = depth[v, u]
+    if not (limits[0] <= z <= limits[1]):
+        return none
+    step = radius // 3
+    reach = 3 * step
+    inverse = 1.0 / z
+    # Normal equations of 1/z = a x + b y + c over the window, x and y from its centre.
+    sxx = sxy = syy = sx = sy = sxr = syr = sr = 0.0
+    n = 0
+    for vv in range(max(v - reach, v % step), min(v + reach + 1, height), step):
+        for uu in range(max(u - reach, u % step), min(u + reach + 1, width), step):
+            other = depth[vv, uu]
+            du, dv = uu - u, vv - v
+            near = max(abs(du), abs(dv)) * z / fx
+            if other <= 0.0 or abs(other - z) > limits[4] * near + 0.005 * z * z + 0.002:
+                continue
+            x, y, r = du / fx, dv / fy, 1.0 / other - inverse
+            sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+            sx, sy, sr = sx + x, sy + y, sr + r
+            sxr, syr = sxr + x * r, syr + y * r
+            n += 1
+    if n < limits[2] * 49:
+        return none
+    sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+    sxr, syr = sxr - sx * sr / n, syr - sy * sr / n
+    det = sxx * syy - sxy * sxy
+    if det <= 1e-6 * sxx * syy:
+        return none
+    a = (syy * sxr - sxy * syr) / det
+    b = (sxx * syr - sxy * sxr) / det
+    c = inverse + (sr - a * sx - b * sy) / n
+    x, y = (u - camera[2]) / fx, (v - camera[3]) / fy
+    # (a, b, constant) . (x, y, 1) = 1/z with x and y from the image's principal point.
+    constant = c - a * x - b * y
+    length = np.sqrt(a * a + b * b + constant * constant)
+    if c < limits[3] * length * np.sqrt(x * x + y * y + 1.0):
+        return none
+    return c, -a / length, -b / length, -constant / length

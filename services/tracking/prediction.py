@@ -1,0 +1,29 @@
+"""Where the camera is expected: its own odometry, or constant velocity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.frames import Frame, Prior
+from shared.se3 import exp, inverse, log
+
+_MAX_EXTRAPOLATION = 3.0
+
+
+def predict(prior: Prior, frame: Frame) -> NDArray[np.float64]:
+    """Expected pose of a frame, T_world_camera, [4, 4]."""
+    if prior.T_odom_camera is not None and frame.T_odom_camera is not None:
+        last, now = prior.T_odom_camera.matrix(), frame.T_odom_camera.matrix()
+        return prior.T_world_camera @ inverse(last) @ now
+    return prior.T_world_camera @ _constant_velocity(prior, frame)
+
+
+def _constant_velocity(prior: Prior, frame: Frame) -> NDArray[np.float64]:
+    """T_last_now, if the last motion goes on; nothing where it is too old to go by."""
+    if prior.before_last_dt_ns <= 0 or prior.lost_frames > 0:
+        return np.eye(4)
+    ratio = (frame.t_ns - prior.t_ns) / prior.before_last_dt_ns
+    if not 0.0 < ratio <= _MAX_EXTRAPOLATION:
+        return np.eye(4)
+    return exp(ratio * log(prior.T_before_last))

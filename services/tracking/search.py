@@ -1,0 +1,136 @@
+"""The search for a frame's pose: prediction first, features without a pose next, the map last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import TrackingConfig, VerificationConfig
+from services.tracking.estimate import Estimate, Observed, attempt
+from services.tracking.keyframes import thumbnail_of
+from services.tracking.local_map import LocalMap, MapSource
+from services.tracking.prediction import predict
+from services.tracking.relocalization import locate
+from services.tracking.stopwatch import Stopwatch
+from services.tracking.verification import is_possible_step
+from shared.frames import TrackingStatus, TrackRequest
+from shared.tracks import CandidatesRequest
+
+
+@dataclass(frozen=True)
+class Job:
+    """One frame on its way through the pipeline."""
+
+    request: TrackRequest
+    observed: Observed
+    source: MapSource
+    config: TrackingConfig
+    clock: Stopwatch
+
+    def attempt(self, local: LocalMap, T_start: NDArray[np.float64]) -> Estimate:
+        """Register and refine from one starting pose."""
+        return attempt(self.observed, local, T_start, self.config, self.clock)
+
+    def locate(self, local: LocalMap) -> NDArray[np.float64] | None:
+        """Pose from features alone."""
+        with self.clock.stage("relocalization"):
+            return locate(
+                self.observed.features,
+                local.context.landmarks,
+                self.observed.image.intrinsics,
+                self.config.orb,
+                self.config.relocalization,
+            )
+
+
+@dataclass(frozen=True)
+class Found:
+    """The outcome of a search; without an estimate the camera is lost."""
+
+    status: TrackingStatus
+    estimate: Estimate | None
+
+
+def search(job: Job, local: LocalMap) -> Found:
+    """Find the pose: nearby, then among the keyframes that look alike."""
+    estimate = _search_nearby(job, local)
+    if estimate is not None:
+        status = _status(job, estimate)
+        if status is not TrackingStatus.LOST:
+            return Found(status, estimate)
+    return _relocalise(job)
+
+
+def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
+    """The best of the attempts around the prior; the first that is beyond doubt ends the search."""
+    prior = job.request.prior
+    if prior is None:
+        return None
+    first = job.attempt(local, predict(prior, job.request.frame))
+    if is_sure(first, job.config.verification):
+        return first
+    starts = [job.locate(local), prior.T_world_camera]
+    others = [job.attempt(local, T) for T in starts if T is not None]
+    return max([first, *others], key=lambda estimate: estimate.score)
+
+
+def _status(job: Job, estimate: Estimate) -> TrackingStatus:
+    """How far an estimate near the prior is believed."""
+    prior, config = job.request.prior, job.config.verification
+    assert prior is not None
+    frames = 1 + prior.lost_frames
+    is_possible = is_possible_step(prior.T_world_camera, estimate.T_world_camera, frames, config)
+    if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
+        return TrackingStatus.TRACKED
+    if is_possible and prior.lost_frames == 0 and is_coarse(estimate, config):
+        return TrackingStatus.COARSE_ONLY
+    return TrackingStatus.LOST
+
+
+def is_sure(estimate: Estimate, config: VerificationConfig) -> bool:
+    """Features and depth agree so well that nothing else needs to be tried."""
+    return (
+        estimate.inliers >= config.sure_inliers
+        and estimate.agreement.share >= config.sure_agreement
+        and estimate.inlier_share >= config.min_inlier_share
+    )
+
+
+def is_confirmed(estimate: Estimate, config: VerificationConfig) -> bool:
+    """Features confirm the pose and depth does not refute it."""
+    return (
+        estimate.inliers >= config.min_inliers
+        and estimate.inlier_share >= config.min_inlier_share
+        and estimate.agreement.share >= config.min_agreement
+        and estimate.registration.overlap >= config.min_overlap
+    )
+
+
+def is_coarse(estimate: Estimate, config: VerificationConfig) -> bool:
+    """Geometry alone holds the pose."""
+    return (
+        estimate.agreement.share >= config.coarse_min_agreement
+        and estimate.registration.overlap >= config.coarse_min_overlap
+    )
+
+
+def _relocalise(job: Job) -> Found:
+    """Ask the map for keyframes that look alike; PnP against each, then a full attempt."""
+    request = CandidatesRequest(
+        thumbnail=thumbnail_of(job.observed.image.rgb),
+        descriptors=job.observed.features.descriptors,
+        limit=job.config.relocalization.max_candidates,
+    )
+    with job.clock.stage("relocalization"):
+        candidates = job.source.candidates(request)
+    for candidate in candidates.keyframes:
+        local = job.source.local_map(candidate.seq)
+        T_start = job.locate(local)
+        if T_start is None:
+            continue
+        estimate = job.attempt(local, T_start)
+        if is_sure(estimate, job.config.verification):
+            return Found(TrackingStatus.RELOCALISED, estimate)
+    return Found(TrackingStatus.LOST, None)

@@ -1,0 +1,87 @@
+"""Is this pose to be believed? What the map says there against what the depth image shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import VerificationConfig
+from shared.rectify import RgbdImage
+from shared.se3 import angle_rad, inverse
+from shared.tracks import PointCloud
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Of the map's points that fall into the image: how many lie on the measured surface."""
+
+    share: float  # on the surface, of those not hidden behind it
+    visible_share: float  # on the surface, of all that fall into the image
+    points: int  # on the surface
+
+
+def depth_agreement(
+    image: RgbdImage,
+    cloud_world: PointCloud,
+    T_world_camera: NDArray[np.float64],
+    config: VerificationConfig,
+) -> Agreement:
+    """Project the map into the depth image. A point in front of the measured surface refutes."""
+    i = image.intrinsics
+    on, front, behind = _compare(
+        image.depth_m,
+        cloud_world.points,
+        cloud_world.normals,
+        inverse(T_world_camera),
+        np.array([i.fx, i.fy, i.cx, i.cy]),
+        np.array([config.depth_tolerance_m, config.depth_tolerance_per_m2]),
+    )
+    return Agreement(on / max(1, on + front), on / max(1, on + front + behind), on)
+
+
+def is_possible_step(
+    T_world_before: NDArray[np.float64],
+    T_world_camera: NDArray[np.float64],
+    frames: int,
+    config: VerificationConfig,
+) -> bool:
+    """Whether a camera can have moved so far in so many frames."""
+    step = inverse(T_world_before) @ T_world_camera
+    is_near = float(np.linalg.norm(step[:3, 3])) <= config.max_step_m * frames
+    return is_near and np.degrees(angle_rad(step)) <= config.max_step_deg * frames
+
+
+@numba.njit(cache=True, nogil=True)
+def _compare(depth, points, normals, T, camera, tolerance):  # pragma: no cover - compiled
+    height, width = depth.shape
+    on = front = behind = 0
+    for n in range(len(points)):
+        p, m = points[n], normals[n]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if z < 0.1:
+            continue
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        u = int(np.floor(camera[0] * x / z + camera[2] + 0.5))
+        v = int(np.floor(camera[1] * y / z + camera[3] + 0.5))
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        measured = depth[v, u]
+        if measured <= 0.0:
+            continue
+        nx = T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2]
+        ny = T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2]
+        nz = T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2]
+        if nx * x + ny * y + nz * z > -0.17 * np.sqrt(x * x + y * y + z * z):
+            continue
+        limit = tolerance[0] + tolerance[1] * z * z
+        if abs(z - measured) <= limit:
+            on += 1
+        elif z < measured:
+            front += 1
+        else:
+            behind += 1
+    return on, front, behind

@@ -1,0 +1,108 @@
+"""The local map as voxels of several sizes: in each, one plane for each way that it may face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.tracks import PointCloud
+
+
+@dataclass(frozen=True)
+class VoxelLevel:
+    """An open-addressing hash table of planes (mean point, mean normal)."""
+
+    voxel_size_m: float
+    keys: NDArray[np.int64]  # [capacity], -1 where empty
+    rows: NDArray[np.int32]  # [capacity], row of the plane
+    points: NDArray[np.float32]  # [V, 3]
+    normals: NDArray[np.float32]  # [V, 3], unit
+
+
+@dataclass(frozen=True)
+class VoxelMap:
+    """A cloud at every level, coarse to fine."""
+
+    levels: tuple[VoxelLevel, ...]
+
+
+def build_voxel_map(cloud: PointCloud, voxel_sizes_m: tuple[float, ...]) -> VoxelMap:
+    """Voxels of a cloud, the same for the same cloud to the bit."""
+    return VoxelMap(tuple(_build_level(cloud, size) for size in voxel_sizes_m))
+
+
+def _build_level(cloud: PointCloud, voxel_size_m: float) -> VoxelLevel:
+    keys, rows, points, normals = _fill(cloud.points, cloud.normals, voxel_size_m)
+    return VoxelLevel(voxel_size_m, keys, rows, points, normals)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def main_axis(x, y, z):  # pragma: no cover - compiled
+    """Index 0 to 5 of the axis direction nearest to a normal."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        return 1 if x > 0.0 else 0
+    if ay >= az:
+        return 3 if y > 0.0 else 2
+    return 5 if z > 0.0 else 4
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def cell_key(direction, i, j, k):  # pragma: no cover - compiled
+    """A voxel and a main axis as one number (20 bits an index)."""
+    mask = np.int64(0xFFFFF)
+    key = (np.int64(direction) << 20) | (np.int64(i) & mask)
+    key = (key << 20) | (np.int64(j) & mask)
+    return (key << 20) | (np.int64(k) & mask)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def find_slot(keys, key):  # pragma: no cover - compiled
+    """The slot that holds the key, or the empty one where it would go."""
+    mask = np.int64(len(keys) - 1)
+    slot = ((key * np.int64(-7046029254386353131)) >> np.int64(24)) & mask
+    while keys[slot] != -1 and keys[slot] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(points, normals, voxel_size):  # pragma: no cover - compiled
+    count = len(points)
+    capacity = 16
+    while capacity < 2 * count:
+        capacity *= 2
+    keys = np.full(capacity, -1, np.int64)
+    rows = np.zeros(capacity, np.int32)
+    sums = np.zeros((count, 7))
+    used = 0
+    for n in range(count):
+        p, m = points[n], normals[n]
+        key = cell_key(
+            main_axis(m[0], m[1], m[2]),
+            np.floor(p[0] / voxel_size),
+            np.floor(p[1] / voxel_size),
+            np.floor(p[2] / voxel_size),
+        )
+        slot = find_slot(keys, key)
+        if keys[slot] == -1:
+            keys[slot] = key
+            rows[slot] = used
+            used += 1
+        row = sums[rows[slot]]
+        for axis in range(3):
+            row[axis] += p[axis]
+            row[3 + axis] += m[axis]
+        row[6] += 1.0
+    means = np.empty((used, 3), np.float32)
+    directions = np.empty((used, 3), np.float32)
+    for n in range(used):
+        row = sums[n]
+        length = np.sqrt(row[3] ** 2 + row[4] ** 2 + row[5] ** 2)
+        for axis in range(3):
+            means[n, axis] = row[axis] / row[6]
+            directions[n, axis] = row[3 + axis] / length
+    return keys, rows, means, directions

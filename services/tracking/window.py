@@ -1,0 +1,228 @@
+"""The bundle-adjustment window of a new keyframe: from the context to a problem and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.bundle_adjustment import BundleProblem, BundleSolution, solve_bundle
+from services.tracking.config import TrackingConfig
+from services.tracking.orb import backproject
+from services.tracking.registration import Registration, optimum
+from shared.camera import Intrinsics
+from shared.se3 import inverse, transform
+from shared.tracks import (
+    KEYPOINT_BITS,
+    Correction,
+    Landmarks,
+    Observations,
+    PointCloud,
+    TrackingContext,
+    WindowKeyframe,
+)
+
+
+@dataclass(frozen=True)
+class NewKeyframe:
+    """A keyframe before bundle adjustment."""
+
+    seq: int
+    T_world_camera: NDArray[np.float64]  # [4, 4]
+    observations: Observations
+    registration: Registration
+
+
+@dataclass(frozen=True)
+class _Observed:
+    """Observations of several cameras in one list, by ascending landmark."""
+
+    camera_index: NDArray[np.int64]  # [O]
+    point_index: NDArray[np.int64]  # [O]
+    measured: NDArray[np.float64]  # [O, 3]
+    sigmas: NDArray[np.float64]  # [O, 2]
+
+
+def adjust_window(
+    keyframe: NewKeyframe,
+    context: TrackingContext,
+    intrinsics: Intrinsics,
+    config: TrackingConfig,
+) -> Correction:
+    """Adjust the new keyframe with its window and place the landmarks that it found.
+
+    Returns:
+        new poses of the window's free keyframes and of this one (last), new positions of the
+        adjusted landmarks and first positions of the new ones.
+    """
+    window = (*context.window, _as_window(keyframe))
+    observed = _observed(window, context.landmarks, config)
+    seen = np.unique(observed.point_index)
+    problem = _problem(window, observed, seen, context, keyframe.registration, intrinsics, config)
+    solution = solve_bundle(problem, intrinsics, config.bundle_adjustment)
+    return _correction(window, problem, solution, context.landmarks.ids[seen], intrinsics)
+
+
+def _as_window(keyframe: NewKeyframe) -> WindowKeyframe:
+    return WindowKeyframe(
+        keyframe.seq, keyframe.T_world_camera, is_fixed=False, observations=keyframe.observations
+    )
+
+
+def first_correction(
+    seq: int,
+    T_world_camera: NDArray[np.float64],
+    observations: Observations,
+    intrinsics: Intrinsics,
+) -> Correction:
+    """The correction of a session's first keyframe: its own pose and landmarks."""
+    ids, positions = _own_landmarks(seq, T_world_camera, observations, intrinsics)
+    return Correction(np.array([seq], np.int64), T_world_camera[None], ids, positions)
+
+
+def _own_landmarks(
+    seq: int,
+    T_world_camera: NDArray[np.float64],
+    observations: Observations,
+    intrinsics: Intrinsics,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Ids and positions of the landmarks that a keyframe founds."""
+    ids = observations.landmark_ids
+    own = np.flatnonzero((ids >= 0) & ((ids >> KEYPOINT_BITS) == seq))
+    points = backproject(observations.keypoints_px[own], observations.depths_m[own], intrinsics)
+    return ids[own], transform(T_world_camera, points)
+
+
+def _observed(
+    window: tuple[WindowKeyframe, ...], landmarks: Landmarks, config: TrackingConfig
+) -> _Observed:
+    """All observations of landmarks that at least two cameras of the window see."""
+    parts = [_camera_rows(k, w.observations, landmarks.ids, config) for k, w in enumerate(window)]
+    cameras, points, measured, sigmas = (np.concatenate(part) for part in zip(*parts, strict=True))
+    counts = np.bincount(points, minlength=len(landmarks.ids))
+    keep = np.flatnonzero(counts[points] >= 2)
+    order = keep[np.argsort(points[keep], kind="stable")]
+    return _Observed(cameras[order], points[order], measured[order], sigmas[order])
+
+
+def _camera_rows(
+    camera: int, observations: Observations, ids: NDArray[np.int64], config: TrackingConfig
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    ba = config.bundle_adjustment
+    at = np.minimum(np.searchsorted(ids, observations.landmark_ids), max(len(ids) - 1, 0))
+    known = ids[at] == observations.landmark_ids if len(ids) else np.zeros(len(at), np.bool_)
+    rows = np.flatnonzero(known)
+    depths = observations.depths_m[rows].astype(np.float64)
+    measured = np.column_stack([observations.keypoints_px[rows], depths]).astype(np.float64)
+    pixel_sigmas = ba.pixel_sigma * 1.2 ** observations.octaves[rows].astype(np.float64)
+    depth_sigmas = ba.depth_sigma_floor_m + ba.depth_sigma_per_m2 * depths**2
+    cameras = np.full(len(rows), camera, np.int64)
+    return cameras, at[rows], measured, np.column_stack([pixel_sigmas, depth_sigmas])
+
+
+def _problem(
+    window: tuple[WindowKeyframe, ...],
+    observed: _Observed,
+    seen: NDArray[np.int64],
+    context: TrackingContext,
+    registration: Registration,
+    intrinsics: Intrinsics,
+    config: TrackingConfig,
+) -> BundleProblem:
+    poses = np.stack([keyframe.T_world_camera for keyframe in window])
+    priors = poses.copy()
+    priors[-1] = optimum(registration, config.registration)
+    information = pose_information(context.cloud_world, poses, registration, intrinsics, config)
+    information[-1] = registration.information
+    return BundleProblem(
+        T_world_cameras=poses,
+        is_fixed=np.array([keyframe.is_fixed for keyframe in window]),
+        T_world_priors=priors,
+        pose_information=config.bundle_adjustment.pose_prior_share * information,
+        points_world=context.landmarks.positions_world[seen],
+        camera_index=observed.camera_index,
+        point_index=np.searchsorted(seen, observed.point_index),
+        measured=observed.measured,
+        sigmas=observed.sigmas,
+    )
+
+
+def pose_information(
+    cloud_world: PointCloud,
+    T_world_cameras: NDArray[np.float64],
+    registration: Registration,
+    intrinsics: Intrinsics,
+    config: TrackingConfig,
+) -> NDArray[np.float64]:
+    """What registering cameras to a cloud would tell of their poses, [K, 6, 6].
+
+    The noise is that of the registration at hand: the same sensor in the same scene.
+    """
+    settings = config.registration
+    sigma = max(registration.residual_scale, settings.model_sigma)
+    i = intrinsics
+    hessians = _visible_hessians(
+        cloud_world.points[::_CLOUD_STEP],
+        cloud_world.normals[::_CLOUD_STEP],
+        inverse(T_world_cameras),
+        np.array([i.fx, i.fy, i.cx, i.cy, i.width, i.height]),
+        np.array([settings.depth_sigma_floor_m, settings.depth_sigma_per_m2]),
+    )
+    return _CLOUD_STEP * settings.effective_share / sigma**2 * hessians
+
+
+_CLOUD_STEP = 4
+
+
+def _correction(
+    window: tuple[WindowKeyframe, ...],
+    problem: BundleProblem,
+    solution: BundleSolution,
+    adjusted_ids: NDArray[np.int64],
+    intrinsics: Intrinsics,
+) -> Correction:
+    free = np.flatnonzero(~problem.is_fixed)
+    new = window[-1]
+    ids, positions = _own_landmarks(
+        new.seq, solution.T_world_cameras[-1], new.observations, intrinsics
+    )
+    return Correction(
+        keyframe_seqs=np.array([window[k].seq for k in free], np.int64),
+        T_world_keyframes=solution.T_world_cameras[free],
+        landmark_ids=np.concatenate([adjusted_ids, ids]),
+        positions_world=np.concatenate([solution.points_world, positions]),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _visible_hessians(points, normals, views, camera, noise):  # pragma: no cover - compiled
+    out = np.zeros((len(views), 6, 6))
+    J = np.zeros(6)
+    p = np.zeros(3)
+    m = np.zeros(3)
+    for k in range(len(views)):
+        T = views[k]
+        for n in range(len(points)):
+            for i in range(3):
+                p[i] = T[i, 3]
+                m[i] = 0.0
+                for j in range(3):
+                    p[i] += T[i, j] * points[n, j]
+                    m[i] += T[i, j] * normals[n, j]
+            if p[2] < 0.1 or p[0] * m[0] + p[1] * m[1] + p[2] * m[2] >= 0.0:
+                continue
+            u = camera[0] * p[0] / p[2] + camera[2]
+            v = camera[1] * p[1] / p[2] + camera[3]
+            if u < 0.0 or v < 0.0 or u >= camera[4] or v >= camera[5]:
+                continue
+            sigma = noise[0] + noise[1] * p[2] * p[2]
+            J[0], J[1], J[2] = m[0], m[1], m[2]
+            J[3] = p[1] * m[2] - p[2] * m[1]
+            J[4] = p[2] * m[0] - p[0] * m[2]
+            J[5] = p[0] * m[1] - p[1] * m[0]
+            for i in range(6):
+                for j in range(6):
+                    out[k, i, j] += J[i] * J[j] / (sigma * sigma)
+    return out
