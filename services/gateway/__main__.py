@@ -14,6 +14,7 @@ import uvicorn
 
 from services.gateway.app import create_app, open_sessions
 from services.gateway.config import GatewayConfig
+from services.gateway.grpc_server import serve_grpc
 from services.gateway.sessions import Sessions
 from shared.bus import Bus, open_bus
 from shared.errors import UnavailableError
@@ -26,7 +27,6 @@ from shared.service import (
     settings_from,
     setup_logging,
 )
-
 
 _UNREAD_MS = 30_000
 
@@ -78,7 +78,11 @@ async def _serve(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, setattr, server, "should_exit", True)
-    await server.serve([listener])
+    try:
+        async with serve_grpc(sessions, arguments.http_host, arguments.grpc_port):
+            await server.serve([listener])
+    finally:
+        await sessions.close()
 
 
 def _uvicorn_config(sessions: Sessions, config: GatewayConfig) -> uvicorn.Config:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-
 from fastapi import FastAPI
 
 from services.gateway.body_limit import BodyLimit
@@ -36,16 +33,10 @@ def open_sessions(bus: Bus, config: GatewayConfig) -> Sessions:
 def create_app(sessions: Sessions) -> FastAPI:
     """The HTTP and WebSocket side."""
 
-    @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        yield
-        await sessions.close()
-
     app = FastAPI(
         title="PointSLAM++",
         version="1",
         description=_DESCRIPTION,
-        lifespan=lifespan,
         redoc_url=None,
     )
     for router in (http_routes(sessions), map_routes(sessions), websocket_routes(sessions)):

@@ -13,19 +13,17 @@ from starlette.responses import Response, StreamingResponse
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
 from services.gateway.decode import plain
+from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, pose_from
 from shared import codec
-from shared.errors import InputError, UnavailableError
+from shared.errors import InputError
 from shared.maps import (
     Empty,
-    ExportChunk,
     ExportFormat,
-    ExportRequest,
     JobStatus,
     RefineRequest,
-    RenderReply,
     RenderRequest,
     SaveReply,
     SaveRequest,
@@ -168,35 +166,6 @@ def _view(session: Session, pose: PoseQuery, camera: CameraQuery, wanted: ViewQu
         what=wanted.what,
         format=wanted.format,
     )
-
-
-async def ask_render(
-    session: Session, request: RenderRequest, config: GatewayConfig
-) -> RenderReply:
-    """A view drawn by the owner of the session's map."""
-    timeout_s = config.mapping.question_timeout_s
-    return await session.owner.ask("render", request, RenderReply, timeout_s)
-
-
-async def export_pieces(
-    session: Session, format: ExportFormat, config: GatewayConfig
-) -> AsyncIterator[ExportChunk]:
-    """The file in pieces, checked to be in order and complete.
-
-    Raises:
-        UnavailableError: the owner went away before the end.
-    """
-    await session.flush(config.mapping.question_timeout_s)
-    timeout_s = config.mapping.export_timeout_s
-    at = total = 0
-    request = ExportRequest(format)
-    async for piece in session.owner.pieces("export", request, ExportChunk, timeout_s):
-        if piece.offset != at:
-            raise UnavailableError(f"the export broke off at byte {at}")
-        at, total = at + len(piece.bytes), piece.total
-        yield piece
-    if at != total:
-        raise UnavailableError(f"the export ended at byte {at} of {total}")
 
 
 async def _file(session: Session, format: ExportFormat, config: GatewayConfig) -> Response:

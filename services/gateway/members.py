@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 from shared.bus import Bus
 
@@ -15,12 +14,7 @@ class Members:
         self.names: frozenset[str] = frozenset()
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
-        self._listeners: list[Callable[[], None]] = []
         bus.watch_alive(role, self._heard)
-
-    def on_change(self, listener: Callable[[], None]) -> None:
-        """Call `listener` whenever a process comes or goes."""
-        self._listeners.append(listener)
 
     async def wait_for_change(self, timeout_s: float) -> None:
         """Wait until a process comes or goes, or the time is over."""
@@ -39,5 +33,3 @@ class Members:
         self.names = self.names | {name} if is_alive else self.names - {name}
         self._changed.set()
         self._changed = asyncio.Event()
-        for listener in self._listeners:
-            listener()

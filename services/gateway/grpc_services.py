@@ -1,0 +1,262 @@
+"""The gRPC services of pointslam.v1, on the same sessions as HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import grpc
+
+from services.gateway.decode import check_frame
+from services.gateway.errors import detail, grpc_status
+from services.gateway.frame_stream import FrameStream, SlowClientError
+from services.gateway.map_queries import ask_render, export_pieces
+from services.gateway.session import Session
+from services.gateway.sessions import CreateRequest, Sessions
+from services.gateway.views import View
+from services.gateway.wire_values import (
+    calibration_from,
+    chosen,
+    frame_from,
+    intrinsics_from,
+    matrix_from,
+    pose_from,
+    reply_to,
+    require,
+    timed_pose_to,
+)
+from shared.errors import InputError, PointSlamError
+from shared.maps import ExportFormat, RenderRequest
+from shared.stream import FrameReply
+from shared.wire import (
+    map_service_pb2,
+    map_service_pb2_grpc,
+    pose_service_pb2,
+    pose_service_pb2_grpc,
+    session_service_pb2,
+    session_service_pb2_grpc,
+    tracking_service_pb2_grpc,
+    types_pb2,
+)
+
+_MODES = {
+    types_pb2.SESSION_MODE_UNSPECIFIED: "live",
+    types_pb2.SESSION_MODE_LIVE: "live",
+    types_pb2.SESSION_MODE_OFFLINE: "offline",
+}
+_MODE_VALUES = {mode: value for value, mode in _MODES.items()}
+_CONTENTS = {
+    map_service_pb2.VIEW_CONTENT_UNSPECIFIED: "colour",
+    map_service_pb2.VIEW_CONTENT_COLOUR: "colour",
+    map_service_pb2.VIEW_CONTENT_DEPTH: "depth",
+}
+_IMAGES = {
+    map_service_pb2.IMAGE_FORMAT_UNSPECIFIED: "jpeg",
+    map_service_pb2.IMAGE_FORMAT_JPEG: "jpeg",
+    map_service_pb2.IMAGE_FORMAT_PNG: "png",
+}
+_IMAGE_VALUES = {name: value for value, name in _IMAGES.items()}
+_FORMATS = {
+    map_service_pb2.MAP_FORMAT_UNSPECIFIED: ExportFormat.PLY,
+    map_service_pb2.MAP_FORMAT_PLY: ExportFormat.PLY,
+    map_service_pb2.MAP_FORMAT_MESH: ExportFormat.MESH,
+    map_service_pb2.MAP_FORMAT_SNAPSHOT: ExportFormat.SNAPSHOT,
+}
+
+
+@asynccontextmanager
+async def _refusing(context: Any) -> AsyncIterator[None]:
+    """Turn an error of ours into the call's status; code and field go as trailing metadata."""
+    try:
+        yield
+    except PointSlamError as error:
+        what = detail(error)
+        metadata = (("pointslam-code", what.code), ("pointslam-field", what.field))
+        await context.abort(grpc_status(error), str(error), metadata)
+
+
+class SessionService(session_service_pb2_grpc.SessionServiceServicer):
+    """Create, find, list and delete sessions."""
+
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
+
+    async def CreateSession(self, request: Any, context: Any) -> Any:
+        """A new session."""
+        async with _refusing(context):
+            has_pose = request.HasField("T_map_first")
+            create = CreateRequest(
+                calibration=calibration_from(require(request, "calibration")),
+                name=request.session_id or None,
+                mode=chosen(request.mode, _MODES, "mode"),
+                seed=request.seed,
+                T_map_first=pose_from(request.T_map_first) if has_pose else None,
+            )
+            session = await self._sessions.create(create)
+            return session_service_pb2.CreateSessionResponse(session=await self._state(session))
+
+    async def GetSession(self, request: Any, context: Any) -> Any:
+        """One session's state."""
+        async with _refusing(context):
+            session = await self._sessions.get(request.session_id)
+            return session_service_pb2.GetSessionResponse(session=await self._state(session))
+
+    async def ListSessions(self, request: Any, context: Any) -> Any:
+        """All sessions."""
+        async with _refusing(context):
+            rows = [
+                session_service_pb2.Session(
+                    session_id=row["session"],
+                    mode=_MODE_VALUES[row["mode"]],
+                    created_ns=row["created_ns"],
+                    mapper=row["mapper"],
+                    keyframes=row["keyframes"],
+                    last_seq=-1,
+                    last_t_ns=-1,
+                )
+                for row in await self._sessions.list()
+            ]
+            return session_service_pb2.ListSessionsResponse(sessions=rows)
+
+    async def DeleteSession(self, request: Any, context: Any) -> Any:
+        """Remove a session."""
+        async with _refusing(context):
+            await self._sessions.delete(request.session_id)
+            return session_service_pb2.DeleteSessionResponse()
+
+    async def _state(self, session: Session) -> session_service_pb2.Session:
+        info = await self._sessions.info(session)
+        tracking = info["tracking"]
+        return session_service_pb2.Session(
+            session_id=session.name,
+            mode=_MODE_VALUES[info["mode"]],
+            created_ns=session.created_ns,
+            mapper=info["mapper"],
+            keyframes=info["keyframes"],
+            last_seq=tracking["last_seq"],
+            last_t_ns=tracking["last_t_ns"],
+            credit=tracking["credit"],
+        )
+
+
+class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
+    """Frames in, poses out."""
+
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
+
+    async def TrackFrames(self, request_iterator: Any, context: Any) -> None:
+        """Answer a stream of frames in order."""
+        async with _refusing(context):
+            requests = aiter(request_iterator)
+            try:
+                first = await anext(requests)
+            except StopAsyncIteration:
+                return
+            session = await self._sessions.get(first.session_id)
+
+            async def read(frames: FrameStream) -> None:
+                await frames.put(lambda: _frame(first, session))
+                async for request in requests:
+                    await frames.put(lambda request=request: _frame(request, session))
+
+            async def send(reply: FrameReply) -> None:
+                await context.write(reply_to(reply))
+
+            stream = FrameStream(session, self._sessions.fabric.config.stream, send)
+            try:
+                await stream.run(read)
+            except SlowClientError:
+                await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "replies are not read")
+
+
+def _frame(request: Any, session: Session) -> Any:
+    if request.session_id not in ("", session.name):
+        raise InputError("session_id", f"this stream is of session {session.name}")
+    message = frame_from(require(request, "frame"))
+    check_frame(message, session.calibration)
+    return message
+
+
+class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
+    """Poses for those who do not send the frames."""
+
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
+
+    async def GetPose(self, request: Any, context: Any) -> Any:
+        """The newest pose."""
+        async with _refusing(context):
+            pose = (await self._sessions.get(request.session_id)).pose()
+            return pose_service_pb2.GetPoseResponse(pose=timed_pose_to(pose))
+
+    async def GetPoseAt(self, request: Any, context: Any) -> Any:
+        """The pose at a time."""
+        async with _refusing(context):
+            pose = (await self._sessions.get(request.session_id)).pose(request.t_ns)
+            return pose_service_pb2.GetPoseAtResponse(pose=timed_pose_to(pose))
+
+    async def WatchPoses(self, request: Any, context: Any) -> AsyncIterator[Any]:
+        """Each new pose, until the client has enough."""
+        async with _refusing(context):
+            session = await self._sessions.get(request.session_id)
+            poses = session.watch()
+            try:
+                while True:
+                    pose = timed_pose_to(await poses.get())
+                    yield pose_service_pb2.WatchPosesResponse(pose=pose)
+            finally:
+                session.unwatch(poses)
+
+
+class MapService(map_service_pb2_grpc.MapServiceServicer):
+    """The map's state, views of it, and the map as a file."""
+
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
+
+    async def GetMapInfo(self, request: Any, context: Any) -> Any:
+        """State of the map."""
+        async with _refusing(context):
+            info = await self._sessions.info(await self._sessions.get(request.session_id))
+            fields = map_service_pb2.GetMapInfoResponse.DESCRIPTOR.fields_by_name
+            values = {name: info[name] for name in fields if name != "session_id"}
+            return map_service_pb2.GetMapInfoResponse(session_id=info["session"], **values)
+
+    async def RenderView(self, request: Any, context: Any) -> Any:
+        """A view as an image."""
+        async with _refusing(context):
+            session = await self._sessions.get(request.session_id)
+            view = _view(request, session)
+            view.check(self._sessions.fabric.config.limits.max_render_pixels)
+            reply = await ask_render(session, view.request, self._sessions.fabric.config)
+            return map_service_pb2.RenderViewResponse(
+                map_revision=reply.revision,
+                format=_IMAGE_VALUES[view.format],
+                image=await asyncio.to_thread(view.encode, reply),
+            )
+
+    async def ExportMap(self, request: Any, context: Any) -> AsyncIterator[Any]:
+        """The map as a file, in pieces."""
+        async with _refusing(context):
+            session = await self._sessions.get(request.session_id)
+            format = chosen(request.format, _FORMATS, "format")
+            async for piece in export_pieces(session, format, self._sessions.fabric.config):
+                yield map_service_pb2.ExportMapResponse(
+                    offset=piece.offset, total=piece.total, bytes=piece.bytes
+                )
+
+
+def _view(request: Any, session: Session) -> View:
+    camera = session.calibration.colour.intrinsics
+    if request.HasField("intrinsics"):
+        camera = intrinsics_from(request.intrinsics)
+    is_timed = request.HasField("appearance_t_ns")
+    T_map_camera = matrix_from(require(request, "T_map_camera"), "T_map_camera")
+    return View(
+        RenderRequest(T_map_camera, camera, request.appearance_t_ns if is_timed else None),
+        chosen(request.content, _CONTENTS, "content"),
+        chosen(request.format, _IMAGES, "format"),
+    )

@@ -1,0 +1,174 @@
+"""Protobuf messages to our values and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.gateway.poses import TimedPose, deviations
+from shared.camera import Calibration, Camera, Intrinsics
+from shared.errors import InputError
+from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
+from shared.se3 import Pose, Quaternion, Vector3
+from shared.stream import DepthMessage, FrameMessage, FrameReply, PriorMessage
+from shared.wire import pose_service_pb2, tracking_service_pb2, types_pb2
+
+_COLOUR = {
+    tracking_service_pb2.COLOUR_ENCODING_JPEG: ColourEncoding.JPEG,
+    tracking_service_pb2.COLOUR_ENCODING_PNG: ColourEncoding.PNG,
+    tracking_service_pb2.COLOUR_ENCODING_RGB8: ColourEncoding.RGB8,
+}
+_DEPTH = {
+    tracking_service_pb2.DEPTH_ENCODING_PNG16: DepthEncoding.PNG16,
+    tracking_service_pb2.DEPTH_ENCODING_RAW16: DepthEncoding.RAW16,
+    tracking_service_pb2.DEPTH_ENCODING_ZLIB16: DepthEncoding.ZLIB16,
+}
+
+_STATUSES: dict[TrackingStatus | None, types_pb2.TrackingStatus] = {
+    None: types_pb2.TRACKING_STATUS_UNSPECIFIED,
+    TrackingStatus.TRACKED: types_pb2.TRACKING_STATUS_TRACKED,
+    TrackingStatus.COARSE_ONLY: types_pb2.TRACKING_STATUS_COARSE_ONLY,
+    TrackingStatus.RELOCALISED: types_pb2.TRACKING_STATUS_RELOCALISED,
+    TrackingStatus.LOST: types_pb2.TRACKING_STATUS_LOST,
+    TrackingStatus.SUPERSEDED: types_pb2.TRACKING_STATUS_SUPERSEDED,
+    TrackingStatus.NEED_FRAMES: types_pb2.TRACKING_STATUS_NEED_FRAMES,
+}
+
+
+def require(message: Any, field: str, where: str = "") -> Any:
+    """A sub-message that must be there.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not message.HasField(field):
+        raise InputError(f"{where}{field}", "is missing")
+    return getattr(message, field)
+
+
+def chosen(value: Any, known: Mapping[Any, Any], field: str) -> Any:
+    """The value of an enumeration.
+
+    Raises:
+        InputError: unspecified or unknown.
+    """
+    if value not in known:
+        raise InputError(field, f"must be one of {', '.join(map(str, known.values()))}")
+    return known[value]
+
+
+def pose_from(message: types_pb2.Pose) -> Pose:
+    """A pose with named components."""
+    p, q = message.position, message.orientation
+    return Pose(Vector3(p.x, p.y, p.z), Quaternion(q.x, q.y, q.z, q.w))
+
+
+def matrix_from(message: types_pb2.Pose, field: str) -> NDArray[np.float64]:
+    """A pose as a 4x4 matrix.
+
+    Raises:
+        InputError: a component is not finite or the quaternion has no length; names the field.
+    """
+    try:
+        return pose_from(message).matrix()
+    except InputError as error:
+        raise InputError(f"{field}.{error.field}", error.reason) from None
+
+
+def pose_to(T: NDArray[np.float64]) -> types_pb2.Pose:
+    """A 4x4 matrix as a pose message."""
+    return _pose_message(Pose.from_matrix(T))
+
+
+def _pose_message(pose: Pose) -> types_pb2.Pose:
+    p, q = pose.position, pose.orientation
+    return types_pb2.Pose(
+        position=types_pb2.Vector3(x=p.x, y=p.y, z=p.z),
+        orientation=types_pb2.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w),
+    )
+
+
+def intrinsics_from(message: types_pb2.Intrinsics) -> Intrinsics:
+    """A pinhole camera."""
+    m = message
+    return Intrinsics(m.fx, m.fy, m.cx, m.cy, m.width, m.height)
+
+
+def _camera_from(message: types_pb2.Camera, where: str) -> Camera:
+    intrinsics = intrinsics_from(require(message, "intrinsics", where))
+    return Camera(intrinsics, tuple(message.distortion), message.fisheye)
+
+
+def calibration_from(message: types_pb2.Calibration) -> Calibration:
+    """An RGB-D device; its numbers are not checked here."""
+    optional: dict[str, Any] = {}
+    if message.HasField("depth"):
+        optional["depth"] = _camera_from(message.depth, "calibration.depth.")
+    if message.HasField("T_colour_depth"):
+        where = "calibration.T_colour_depth"
+        optional["T_colour_depth"] = matrix_from(message.T_colour_depth, where)
+    if message.HasField("max_depth_m"):
+        optional["max_depth_m"] = message.max_depth_m
+    colour = _camera_from(require(message, "colour", "calibration."), "calibration.colour.")
+    return Calibration(colour, message.depth_scale, **optional)
+
+
+def frame_from(message: tracking_service_pb2.Frame) -> FrameMessage:
+    """A frame; its images are not checked here."""
+    depth, prior = message.depth, None
+    if message.HasField("prior"):
+        prior = PriorMessage(pose_from(require(message.prior, "T_odom_camera", "prior.")))
+    return FrameMessage(
+        seq=message.seq,
+        t_ns=message.t_ns,
+        rgb=ColourImage(chosen(message.rgb.encoding, _COLOUR, "rgb.encoding"), message.rgb.bytes),
+        depth=DepthMessage(
+            chosen(depth.encoding, _DEPTH, "depth.encoding"),
+            depth.bytes,
+            depth.scale if depth.HasField("scale") else None,
+        ),
+        prior=prior,
+        flags=tuple(message.flags),
+    )
+
+
+def reply_to(reply: FrameReply) -> tracking_service_pb2.TrackFramesResponse:
+    """A frame's reply."""
+    pose, error = reply.T_map_camera, reply.error
+    return tracking_service_pb2.TrackFramesResponse(
+        seq=reply.seq,
+        t_ns=reply.t_ns,
+        status=_STATUSES[reply.status],
+        T_map_camera=_pose_message(pose) if pose else None,
+        pos_std_m=reply.pos_std_m,
+        rot_std_deg=reply.rot_std_deg,
+        inliers=reply.inliers,
+        inlier_share=reply.inlier_share,
+        reference_seq=reply.reference_seq,
+        map_revision=reply.map_revision,
+        keyframe=reply.keyframe,
+        timings_ms=reply.timings_ms,
+        credit=reply.credit,
+        error=types_pb2.ErrorDetail(code=error.code, field=error.field, reason=error.reason)
+        if error
+        else None,
+    )
+
+
+def timed_pose_to(pose: TimedPose) -> pose_service_pb2.TimedPose:
+    """A pose at a time."""
+    deviation = deviations(pose.covariance)
+    return pose_service_pb2.TimedPose(
+        seq=pose.seq,
+        t_ns=pose.t_ns,
+        status=_STATUSES[pose.status],
+        T_map_camera=pose_to(pose.T_map_camera),
+        pos_std_m=deviation[0] if deviation else None,
+        rot_std_deg=deviation[1] if deviation else None,
+        reference_seq=pose.reference_seq,
+        map_revision=pose.map_revision,
+        is_interpolated=pose.is_interpolated,
+    )
