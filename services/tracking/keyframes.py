@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.tracking.config import KeyframeRuleConfig
+from services.tracking.config import KeyframeRuleConfig, SurfaceConfig
 from services.tracking.orb import Features
 from services.tracking.point_cloud import normals_at
-from services.tracking.config import SurfaceConfig
 from shared.frames import Frame, Prior
 from shared.rectify import RgbdImage
 from shared.se3 import angle_rad, inverse

@@ -196,4 +196,4 @@ def _reference(job: Job, estimate: Estimate) -> tuple[int, NDArray[np.float64]]:
 
 def _covariance(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of the information; what nothing is known of gets a metre or a radian."""
-    return np.linalg.inv(information + np.eye(6))
+    return np.asarray(np.linalg.inv(information + np.eye(6)), np.float64)

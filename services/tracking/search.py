@@ -71,7 +71,7 @@ def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
     first = job.attempt(local, predict(prior, job.request.frame))
     if is_sure(first, job.config.verification):
         return first
-    starts = [job.locate(local), prior.T_world_camera]
+    starts = [job.locate(local), prior.T_world_camera.copy()]
     others = [job.attempt(local, T) for T in starts if T is not None]
     return max([first, *others], key=lambda estimate: estimate.score)
 

@@ -1,0 +1,58 @@
+"""Tracking service: RGB-D frames in, camera poses and keyframes out.
+
+python -m services.tracking --connect tcp/127.0.0.1:7447 --id w0
+"""
+
+from __future__ import annotations
+
+import sys
+
+from shared.service import limit_blas_threads
+
+limit_blas_threads()  # before numpy is imported, or it holds for nothing
+
+from concurrent.futures import ThreadPoolExecutor  # noqa: E402
+
+import cv2  # noqa: E402
+
+from services.tracking.config import TrackingConfig  # noqa: E402
+from services.tracking.warm_up import warm_up  # noqa: E402
+from services.tracking.worker import Worker  # noqa: E402
+from shared.bus import Keys, open_bus  # noqa: E402
+from shared.frames import TrackRequest  # noqa: E402
+from shared.service import (  # noqa: E402
+    announce_ready,
+    endpoints,
+    run_service,
+    service_arguments,
+    settings_from,
+    setup_logging,
+    stop_event,
+)
+
+
+def main(argv: list[str]) -> None:
+    """Serve frames until SIGTERM.
+
+    Raises:
+        PointSlamError: a setting is wrong or no router answers.
+    """
+    arguments = service_arguments(__doc__).parse_args(argv)
+    setup_logging(arguments.json_log)
+    config = settings_from(arguments, TrackingConfig())
+    stop = stop_event()
+    cv2.setNumThreads(1)  # frames of several sessions are what runs side by side
+    warm_up(config)
+    with (
+        open_bus(endpoints(arguments)) as bus,
+        ThreadPoolExecutor(config.concurrent_frames, "frame") as executor,
+    ):
+        worker = Worker(bus, config)
+        bus.serve(Keys.track(arguments.id), TrackRequest, worker.answer, executor)
+        bus.declare_alive("tracking", arguments.id)
+        announce_ready(arguments.id)
+        stop.wait()
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(main, sys.argv[1:]))

@@ -1,0 +1,104 @@
+"""A worker on the bus: fetches and caches contexts, answers frames. Its memory is only a cache."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Any
+
+from services.tracking.config import TrackingConfig
+from services.tracking.local_map import LocalMap, derive
+from services.tracking.pipeline import track
+from shared.bus import Bus, Keys
+from shared.frames import TrackRequest
+from shared.tracks import (
+    Candidates,
+    CandidatesRequest,
+    ContextRequest,
+    TrackingContext,
+    TrackResult,
+)
+
+ContextKey = tuple[str, int, int, int]  # session, epoch, revision, reference_seq
+
+
+class ContextCache:
+    """The last few local maps, of all sessions; safe between threads."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._maps: OrderedDict[ContextKey, LocalMap] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def get(self, key: ContextKey) -> LocalMap | None:
+        """The map of a key, now the most recently used one."""
+        with self._lock:
+            if key in self._maps:
+                self._maps.move_to_end(key)
+            return self._maps.get(key)
+
+    def put(self, key: ContextKey, local: LocalMap) -> None:
+        """Keep a map; the least recently used one leaves when there are too many."""
+        with self._lock:
+            self._maps[key] = local
+            self._maps.move_to_end(key)
+            while len(self._maps) > self._limit:
+                self._maps.popitem(last=False)
+
+
+class BusSource:
+    """The owner of one session's map, asked over the bus."""
+
+    def __init__(
+        self, bus: Bus, request: TrackRequest, cache: ContextCache, config: TrackingConfig
+    ) -> None:
+        self._bus = bus
+        self._request = request
+        self._cache = cache
+        self._config = config
+
+    def local_map(self, reference_seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe, from the cache where it is there."""
+        request = self._request
+        asked = (request.session, request.epoch, request.map_revision, reference_seq)
+        local = self._cache.get(asked)
+        if local is None:
+            context: TrackingContext = self._ask(
+                "context", ContextRequest(request.map_revision, reference_seq), TrackingContext
+            )
+            local = derive(context, self._config.registration)
+            # A live map may have moved on: then this is the answer for its revision only.
+            self._cache.put((*asked[:2], context.revision, reference_seq), local)
+        return local
+
+    def candidates(self, request: CandidatesRequest) -> Candidates:
+        """Keyframes that look like a frame."""
+        return self._ask("candidates", request, Candidates)
+
+    def _ask(self, question: str, message: object, kind: type) -> Any:
+        key = Keys.session(self._request.session, self._request.epoch, question)
+        return self._bus.query(key, message, kind, self._config.query_timeout_s)
+
+
+class Worker:
+    """Answers frames of any session."""
+
+    def __init__(self, bus: Bus, config: TrackingConfig) -> None:
+        self._bus = bus
+        self._config = config
+        self._cache = ContextCache(config.context_cache)
+
+    def answer(self, request: TrackRequest) -> TrackResult:
+        """Track one frame.
+
+        Raises:
+            InputError: calibration or images cannot be used; names the field.
+            UnavailableError: the map's owner does not answer.
+        """
+        request.calibration.check()
+        return track(
+            request, BusSource(self._bus, request, self._cache, self._config), self._config
+        )
