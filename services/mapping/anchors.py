@@ -1,0 +1,136 @@
+"""The anchors of the map: N_v = {(p_v, f_v, l_v, O_v)} (paper Eq. 3), one row each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from services.mapping.config import AnchorConfig
+from services.mapping.rows import RowTable
+from services.mapping.voxels import level_of, voxel_keys
+from shared import se3
+
+FEATURES = 32
+TRAINED = ("features", "offsets", "scalings")
+
+
+@dataclass(frozen=True)
+class NewAnchors:
+    """Anchors to be added; rows of numpy arrays."""
+
+    positions: NDArray[np.float32]  # p_v, [A, 3], world, metres
+    features: NDArray[np.float32]  # f_v, [A, 32]
+    offsets: NDArray[np.float32]  # O_v, [A, k * 3], in units of exp(scalings[:3])
+    scalings: NDArray[np.float32]  # [A, 6], log metres: l_v of the offsets, then of the sizes
+    keys: NDArray[np.int64]  # [A], the voxel that each one fills
+    is_primary: NDArray[np.bool_]  # [A]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def take(self, index: NDArray[np.int64]) -> NewAnchors:
+        """The rows of `index`."""
+        return NewAnchors(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def first(self, count: int) -> NewAnchors:
+        """At most `count` of them, primary ones first."""
+        return self.take(np.argsort(~self.is_primary, kind="stable")[:count])
+
+
+class AnchorMap:
+    """All anchors with their optimizer state and statistics, on one device."""
+
+    def __init__(self, config: AnchorConfig, device: torch.device) -> None:
+        self._config = config
+        self.device = device
+        self.rows = RowTable(_columns(config.children), device)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def num_primary(self) -> int:
+        """How many anchors come from ORB points."""
+        return int(self.rows["is_primary"].sum())
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the map itself, without optimizer state."""
+        return len(self) * 4 * (3 + FEATURES + 3 * self._config.children + 6)
+
+    def keys(self) -> NDArray[np.int64]:
+        """The voxels that are taken, [N]."""
+        return self.rows["key"].cpu().numpy()
+
+    def append(self, new: NewAnchors, creator_seq: int) -> int:
+        """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many."""
+        new = new.first(self._config.max_anchors - len(self))
+        if len(new) == 0:
+            return 0
+        is_primary = torch.from_numpy(new.is_primary)
+        self.rows.append(
+            {
+                "position": torch.from_numpy(new.positions),
+                "features": torch.from_numpy(new.features),
+                "offsets": torch.from_numpy(new.offsets),
+                "scalings": torch.from_numpy(new.scalings),
+                "key": torch.from_numpy(new.keys),
+                "is_primary": is_primary,
+                "rate": torch.where(is_primary, self._config.primary_rate, 1.0),
+                "creator": torch.full((len(new),), creator_seq, dtype=torch.int64),
+            }
+        )
+        return len(new)
+
+    def move(self, creator_seq: int, T_new_old: NDArray[np.float64]) -> None:
+        """Take the anchors of a keyframe along with its correction.
+
+        Positions and offsets turn with the keyframe. The networks' quaternions cannot, but the
+        angles of corrections are small and the next iterations see to the rest.
+        """
+        index = torch.nonzero(self.rows["creator"] == creator_seq)[:, 0]
+        R = torch.from_numpy(T_new_old[:3, :3]).to(self.rows["position"])
+        positions = self.rows["position"][index].cpu().numpy()
+        moved = se3.transform(T_new_old, positions.astype(np.float64))
+        levels = level_of(self.rows["key"][index].cpu().numpy())
+        keys = voxel_keys(moved, levels, self._config)
+        self.rows["position"][index] = torch.from_numpy(moved).to(self.rows["position"])
+        self.rows["key"][index] = torch.from_numpy(keys).to(self.device)
+        sizes = self.rows["scalings"][index, None, :3].exp()
+        offsets = self.rows["offsets"][index].view(len(index), -1, 3) * sizes
+        self.rows["offsets"][index] = ((offsets @ R.T) / sizes).view(len(index), -1)
+
+    def state(self) -> dict[str, Tensor]:
+        """All rows, for a snapshot."""
+        return self.rows.state()
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Replace all rows."""
+        self.rows.restore(state)
+
+
+def _columns(children: int) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+    widths = {"features": FEATURES, "offsets": 3 * children, "scalings": 6}
+    trained = {
+        f"{name}{suffix}": ((widths[name],), torch.float32)
+        for name in TRAINED
+        for suffix in ("", "_mean", "_square")  # the value and Adam's moments
+    }
+    return {
+        **trained,
+        "position": ((3,), torch.float32),
+        "steps": ((), torch.int64),
+        "rate": ((), torch.float32),
+        "is_primary": ((), torch.bool),
+        "creator": ((), torch.int64),
+        "key": ((), torch.int64),
+        "opacity_sum": ((), torch.float32),
+        "visits": ((), torch.float32),
+        "gradient_sum": ((children,), torch.float32),
+        "gradient_visits": ((children,), torch.float32),
+    }

@@ -1,0 +1,140 @@
+"""Settings of the mapping service; one group a step, units in the names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from services.mapping.keyframes import KeyframeConfig
+from shared.errors import ConfigError
+
+
+def _check(is_fine: bool, text: str) -> None:
+    if not is_fine:
+        raise ConfigError(text)
+
+
+@dataclass(frozen=True)
+class AnchorConfig:
+    """Where anchors go and how they start (paper, "Neural-Gaussian Representation")."""
+
+    children: int = 5  # k, Gaussians per anchor
+    voxel_size_m: float = 0.02  # at the reference depth; doubles and halves with the depth
+    reference_depth_m: float = 2.0
+    max_anchors: int = 400_000
+    initial_opacity: float = 0.6
+    initial_sigma: float = 0.6  # of the spacing of the depth samples
+    primary_rate: float = 0.1  # learning rate of primary anchors, of the secondary ones'
+    min_alpha: float = 0.5  # a pixel below this is not covered by the map
+    min_depth_gap_m: float = 0.03  # measured depth this much in front, and by this share,
+    min_depth_gap: float = 0.06  # is not covered
+    min_samples: int = 2  # depth samples in a voxel that make an anchor
+
+    def __post_init__(self) -> None:
+        _check(1 <= self.children <= 10, f"anchors.children must be 1 to 10, got {self.children}")
+        _check(self.voxel_size_m > 0, "anchors.voxel_size_m must be positive")
+        _check(self.reference_depth_m > 0, "anchors.reference_depth_m must be positive")
+        _check(self.max_anchors > 0, "anchors.max_anchors must be positive")
+        _check(0 < self.initial_opacity < 1, "anchors.initial_opacity must be between 0 and 1")
+
+
+@dataclass(frozen=True)
+class DecoderConfig:
+    """The networks F_a of Eq. 6."""
+
+    hidden: int = 32
+    max_visible_anchors: int = 250_000  # the nearest ones are drawn
+
+    def __post_init__(self) -> None:
+        _check(self.hidden > 0, "decoder.hidden must be positive")
+        _check(self.max_visible_anchors > 0, "decoder.max_visible_anchors must be positive")
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Steps of Adam, per parameter."""
+
+    features: float = 1e-2
+    offsets: float = 0.02
+    scalings: float = 7e-3
+    opacity_network: float = 2e-3
+    colour_network: float = 8e-3
+    covariance_network: float = 4e-3
+    exposure_gain: float = 5e-3
+    exposure_bias: float = 2e-3
+    refinement_decay: float = 0.1  # of all rates, at the end of a refinement
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of Eq. 8; the colour terms share one: (1 - ssim) L1 + ssim (1 - SSIM)."""
+
+    ssim: float = 0.2
+    depth: float = 0.1
+    max_depth_error_m: float = 0.3  # a larger error is an outlier of the sensor
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.ssim <= 1, f"loss.ssim must be 0 to 1, got {self.ssim}")
+        _check(self.depth >= 0, f"loss.depth must not be negative, got {self.depth}")
+
+
+@dataclass(frozen=True)
+class DensificationConfig:
+    """Growing and culling of secondary anchors, counted in iterations."""
+
+    first_iteration: int = 1500
+    grow_interval: int = 200
+    grow_share: float = 0.01  # of the anchors, each time
+    min_visits: int = 8  # a child is judged after so many iterations that saw it
+    cull_interval: int = 200
+    cull_opacity: float = 0.005  # mean of an anchor's children
+    cull_visits: int = 20
+
+    def __post_init__(self) -> None:
+        _check(self.grow_interval > 0, "densification.grow_interval must be positive")
+        _check(self.cull_interval > 0, "densification.cull_interval must be positive")
+        _check(0 <= self.grow_share <= 1, "densification.grow_share must be 0 to 1")
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Which keyframe each iteration draws, and how many iterations a frame gives."""
+
+    iterations_per_frame: int = 2
+    newest_share: float = 0.3  # of draws; the others are uniform over all keyframes
+    cached_views: int = 16  # with their statistics for SSIM
+    cached_images_mb: int = 256  # decoded images
+    min_shift_m: float = 0.002  # a keyframe corrected by more takes its anchors along
+    min_turn_deg: float = 0.05
+
+    def __post_init__(self) -> None:
+        _check(self.iterations_per_frame >= 0, "schedule.iterations_per_frame is negative")
+        _check(0 <= self.newest_share <= 1, "schedule.newest_share must be 0 to 1")
+        _check(self.cached_views > 0, "schedule.cached_views must be positive")
+
+
+@dataclass(frozen=True)
+class OwnerConfig:
+    """The session around the map."""
+
+    max_pending: int = 8  # offline: entries not yet worked through, before replies wait
+    snapshot_interval_s: float = 180.0
+    live_idle_s: float = 60.0  # live: optimise for so long after the last entry
+    chunk_bytes: int = 4 << 20
+
+    def __post_init__(self) -> None:
+        _check(self.max_pending > 0, "owner.max_pending must be positive")
+        _check(self.chunk_bytes > 0, "owner.chunk_bytes must be positive")
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """All settings of the mapping service."""
+
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    rates: LearningRates = field(default_factory=LearningRates)
+    loss: LossConfig = field(default_factory=LossConfig)
+    densification: DensificationConfig = field(default_factory=DensificationConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    owner: OwnerConfig = field(default_factory=OwnerConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)

@@ -1,0 +1,117 @@
+"""Growing and culling of secondary anchors (Scaffold-GS, section 3.3, on our voxels)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from services.mapping.anchors import AnchorMap, NewAnchors
+from services.mapping.config import AnchorConfig, DensificationConfig
+from services.mapping.voxels import MIN_LEVEL, centres, level_of, sizes_m, voxel_keys
+
+_CHILD_SPREAD = 0.25  # of a voxel: new children around their parent child
+_SHRINK = 1.6  # sigma of a grown child, of its parent's: 1 / 1.6, as 3DGS splits
+
+
+def record(
+    anchors: AnchorMap, index: Tensor, opacities: Tensor, gradient_norms: Tensor | None
+) -> None:
+    """Add one iteration to the statistics of the anchors it saw.
+
+    Args:
+        index: rows of the map, [V].
+        opacities: of their children, [V * k].
+        gradient_norms: of the children's projected means, [V * k]; 0 where not seen.
+    """
+    rows, count = anchors.rows, len(index)
+    rows["opacity_sum"].index_add_(0, index, opacities.view(count, -1).mean(1))
+    rows["visits"].index_add_(0, index, torch.ones_like(index, dtype=torch.float32))
+    if gradient_norms is not None:
+        norms = gradient_norms.view(count, -1)
+        rows["gradient_sum"].index_add_(0, index, norms)
+        rows["gradient_visits"].index_add_(0, index, (norms > 0).float())
+
+
+def cull(anchors: AnchorMap, config: DensificationConfig) -> int:
+    """Remove secondary anchors whose children hardly show; starts a new count. Returns how many."""
+    rows = anchors.rows
+    is_faint = rows["opacity_sum"] < config.cull_opacity * rows["visits"]
+    is_judged = rows["visits"] > config.cull_visits
+    is_culled = is_faint & is_judged & ~rows["is_primary"]
+    rows["opacity_sum"].zero_()
+    rows["visits"].zero_()
+    if bool(is_culled.any()):
+        rows.keep(~is_culled)
+    return int(is_culled.sum())
+
+
+def grow(
+    anchors: AnchorMap,
+    config: DensificationConfig,
+    placement: AnchorConfig,
+    rng: np.random.Generator,
+) -> int:
+    """New anchors, in voxels of half the size, around the children with the largest gradients.
+
+    Returns how many. The statistics start anew.
+    """
+    rows = anchors.rows
+    visits = rows["gradient_visits"]
+    means = rows["gradient_sum"] / visits.clamp_min(1.0)
+    means[visits < config.min_visits] = 0.0
+    count = min(int(config.grow_share * len(anchors)), int((means > 0).sum()))
+    chosen = means.flatten().topk(count).indices
+    k = visits.shape[1]
+    parents, children = (chosen // k).cpu().numpy(), (chosen % k).cpu().numpy()
+    added = 0
+    if count:
+        new = _around(anchors, parents, children, placement, rng)
+        added = _append_by_creator(anchors, new, rows["creator"].cpu().numpy()[parents])
+    for name in ("gradient_sum", "gradient_visits"):
+        anchors.rows[name].zero_()
+    return added
+
+
+def _around(
+    anchors: AnchorMap,
+    parents: NDArray[np.int64],
+    children: NDArray[np.int64],
+    config: AnchorConfig,
+    rng: np.random.Generator,
+) -> NewAnchors:
+    """One anchor for each (parent, child); not yet sorted out by voxel."""
+    at = torch.from_numpy(parents)
+    offsets, scalings, positions, features, keys = (
+        anchors.rows[name][at.to(anchors.device)].cpu().numpy()
+        for name in ("offsets", "scalings", "position", "features", "key")
+    )
+    own = offsets.reshape(len(parents), -1, 3)[np.arange(len(parents)), children]
+    points = positions + own * np.exp(scalings[:, :3])
+    levels = np.maximum(level_of(keys) - 1, MIN_LEVEL)
+    sides = sizes_m(levels, config)[:, None]
+    grown = centres(points, levels, config)
+    spread = rng.normal(0.0, _CHILD_SPREAD, (len(parents), config.children, 3))
+    new_offsets = ((points - grown) / sides)[:, None] + spread
+    sizes = np.minimum(scalings[:, 3:] - math.log(_SHRINK), np.log(sides))
+    return NewAnchors(
+        positions=grown,
+        features=features,
+        offsets=new_offsets.reshape(len(parents), -1).astype(np.float32),
+        scalings=np.concatenate([np.repeat(np.log(sides), 3, 1), sizes], 1).astype(np.float32),
+        keys=voxel_keys(points, levels, config),
+        is_primary=np.zeros(len(parents), bool),
+    )
+
+
+def _append_by_creator(anchors: AnchorMap, new: NewAnchors, creators: NDArray[np.int64]) -> int:
+    """Add those whose voxel is free, each moving with its parent's keyframe from now on."""
+    _, first = np.unique(new.keys, return_index=True)
+    free = first[~np.isin(new.keys[first], anchors.keys())]
+    added = 0
+    for creator in np.unique(creators[free]):
+        added += anchors.append(new.take(free[creators[free] == creator]), int(creator))
+    return added

@@ -1,0 +1,85 @@
+"""The map as files: 3DGS splats (PLY), and the session's folder (tar)."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from services.mapping.decoder import VisibleAnchors, decode
+from services.mapping.pipeline import Mapper
+from services.mapping.rasterizer import Gaussians
+from services.mapping.storage import storage_errors
+from shared.maps import ExportChunk
+
+SH_DC = 0.28209479177387814  # the constant basis function: colour = 0.5 + SH_DC * f_dc
+MIN_OPACITY = 1.0 / 255.0
+_PROPERTIES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+def chunks(data: bytes, size: int) -> Iterator[ExportChunk]:
+    """A file in pieces of `size` bytes; one empty piece for an empty file."""
+    for offset in range(0, max(1, len(data)), size):
+        yield ExportChunk(offset, len(data), data[offset : offset + size])
+
+
+def export_ply(mapper: Mapper) -> bytes:
+    """The map's Gaussians, each as the keyframe that made its anchor sees it, as a 3DGS PLY.
+
+    Spherical harmonics of degree 0; opacity as a logit, scales as logarithms, quaternions wxyz.
+    """
+    return ply_bytes(bake(mapper))
+
+
+@torch.no_grad()
+def bake(mapper: Mapper) -> Gaussians:
+    """All Gaussians that show, decoded for the views of their anchors' keyframes."""
+    creators = mapper.anchors.rows["creator"]
+    parts = []
+    for seq in creators.unique().tolist():
+        visible = VisibleAnchors.gather(mapper.anchors, (creators == seq).nonzero()[:, 0], False)
+        centre = torch.from_numpy(mapper.views[seq].T_world_camera[:3, 3]).to(visible.positions)
+        parts.append(decode(visible, centre, mapper.weights))
+    joined = [torch.cat(tensors) for tensors in zip(*(p.tensors() for p in parts), strict=True)]
+    if not joined:
+        return Gaussians(*(torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (3,))))
+    shows = joined[3] > MIN_OPACITY
+    return Gaussians(*(tensor[shows] for tensor in joined))
+
+
+def ply_bytes(gaussians: Gaussians) -> bytes:
+    """Gaussians in the binary PLY that splat viewers read."""
+    means, scales, quats, opacities, colours = (
+        tensor.detach().cpu().numpy() for tensor in gaussians.tensors()
+    )
+    opacities = opacities.clip(1e-6, 1.0 - 1e-6)[:, None]
+    columns: list[NDArray] = [
+        means,
+        np.zeros_like(means),
+        (colours - 0.5) / SH_DC,
+        np.log(opacities / (1.0 - opacities)),
+        np.log(scales.clip(1e-9)),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-12),
+    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
+    header += [f"property float {name}" for name in _PROPERTIES]
+    text = "\n".join([*header, "end_header", ""])
+    return text.encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
+
+
+def pack_folder(session: Path) -> bytes:
+    """The session's folder as an uncompressed tar; a log's growth meanwhile is left out."""
+    buffer = io.BytesIO()
+    with storage_errors(str(session)), tarfile.open(fileobj=buffer, mode="w") as archive:
+        for path in sorted(p for p in session.rglob("*") if p.is_file() and p.name != "lock"):
+            if ".tmp" not in str(path.relative_to(session)):
+                archive.add(path, arcname=str(Path(session.name) / path.relative_to(session)))
+    return buffer.getvalue()

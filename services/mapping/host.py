@@ -1,0 +1,241 @@
+"""All sessions of one mapper, and the keys that it answers on the bus."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from services.mapping.config import MappingConfig
+from services.mapping.ledger import count_keyframes
+from services.mapping.session import Session, Surroundings
+from services.mapping.storage import (
+    SessionFolder,
+    SessionRecord,
+    check_session_name,
+    has_session,
+    read_record,
+    remove_session,
+    storage_errors,
+)
+from services.mapping.worker import LIVE, OFFLINE
+from shared import codec
+from shared.bus import Bus, Keys
+from shared.errors import ConflictError, InputError, NotFoundError, PointSlamError
+from shared.maps import (
+    DeleteRequest,
+    Empty,
+    ExportRequest,
+    RefineRequest,
+    RenderRequest,
+    SaveRequest,
+    SessionList,
+    SessionSummary,
+    TrajectoryRequest,
+)
+from shared.tracks import (
+    Advance,
+    CandidatesRequest,
+    ContextRequest,
+    KeyframePoses,
+    OpenReply,
+    OpenRequest,
+)
+
+LOGGER = logging.getLogger(__name__)
+_QUERY_THREADS = 8
+
+
+@dataclass(frozen=True)
+class MapperSettings:
+    """Who this mapper is and where it works."""
+
+    name: str
+    data: Path
+    config: MappingConfig
+    device: torch.device
+
+
+@dataclass
+class _Served:
+    """An open session and what must be undone to close it."""
+
+    session: Session
+    advances: ThreadPoolExecutor  # one thread: the entries of a session stay in order
+    stops: list[Callable[[], None]] = field(default_factory=list)
+
+
+class MapperHost:
+    """Opens, lists and deletes sessions, and serves those that are open."""
+
+    def __init__(self, bus: Bus, settings: MapperSettings) -> None:
+        self._bus = bus
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._served: dict[str, _Served] = {}
+        self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
+        with storage_errors(str(settings.data)):
+            settings.data.mkdir(parents=True, exist_ok=True)
+
+    def start(self) -> None:
+        """Answer the mapper's own keys and be seen."""
+        name = self._settings.name
+        for question, kind, answer in (
+            ("open", OpenRequest, self.open),
+            ("list", Empty, lambda _: self.list()),
+            ("delete", DeleteRequest, self.delete),
+        ):
+            self._bus.serve(Keys.mapper(name, question), kind, answer, self._queries)
+        self._bus.declare_alive("mapping", name)
+
+    def open(self, request: OpenRequest) -> OpenReply:
+        """Create a session, take one up from disk, or name the one that is open.
+
+        Raises:
+            InputError: the name, mode or calibration cannot be used.
+            NotFoundError: no such session, and no calibration to create it with.
+            ConflictError: the session exists with another calibration, or elsewhere.
+            StorageError: the disk refused, or its log is damaged.
+        """
+        check_session_name(request.session)
+        with self._lock:
+            if request.session not in self._served:
+                self._served[request.session] = self._serve(self._open_folder(request))
+            elif request.calibration is not None:
+                _check_same(self._served[request.session].session.record, request)
+            return self._served[request.session].session.opening()
+
+    def list(self) -> SessionList:
+        """All sessions on this mapper's disk."""
+        with self._lock:
+            folders = sorted(p for p in self._settings.data.iterdir() if has_session(p))
+            return SessionList(tuple(self._summary(folder) for folder in folders))
+
+    def delete(self, request: DeleteRequest) -> Empty:
+        """Close a session and remove every byte of it.
+
+        Raises:
+            NotFoundError: there is no such session.
+        """
+        check_session_name(request.session)
+        path = self._settings.data / request.session
+        with self._lock:
+            if not has_session(path):
+                raise NotFoundError(f"there is no session {request.session}")
+            if (served := self._served.pop(request.session, None)) is not None:
+                _withdraw(served, is_saved=False)
+            remove_session(path)
+        return Empty()
+
+    def close(self) -> None:
+        """Withdraw every session, with a snapshot of each."""
+        with self._lock:
+            for served in self._served.values():
+                _withdraw(served, is_saved=True)
+            self._served.clear()
+        self._queries.shutdown(wait=False, cancel_futures=True)
+
+    def _open_folder(self, request: OpenRequest) -> SessionFolder:
+        path = self._settings.data / request.session
+        if has_session(path):
+            if request.calibration is not None:
+                _check_same(read_record(path), request)
+            return SessionFolder(path)
+        record = _new_record(request)
+        folder = SessionFolder(path)
+        folder.write_record(record)
+        return folder
+
+    def _serve(self, folder: SessionFolder) -> _Served:
+        settings = self._settings
+        surroundings = Surroundings(settings.name, settings.config, settings.device, self._publish)
+        try:
+            session = Session(folder, surroundings)
+        except PointSlamError:
+            folder.close()
+            raise
+        served = _Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
+        record = session.record
+        for question, kind, answer in _answers(session):
+            executor = served.advances if question == "advance" else self._queries
+            key = Keys.session(record.session, record.epoch, question)
+            served.stops.append(self._bus.serve(key, kind, answer, executor))
+        LOGGER.info(
+            "%s: epoch %d, %d frames, %d keyframes",
+            record.session,
+            record.epoch,
+            session.ledger.entries,
+            session.ledger.num_keyframes,
+        )
+        return served
+
+    def _publish(self, session: str, poses: KeyframePoses) -> None:
+        self._bus.publish(Keys.revisions(session), poses)
+
+    def _summary(self, folder: Path) -> SessionSummary:
+        record = read_record(folder)
+        served = self._served.get(folder.name)
+        keyframes = served.session.ledger.num_keyframes if served else count_keyframes(folder)
+        return SessionSummary(
+            session=record.session,
+            created_ns=record.created_ns,
+            mode=record.mode,
+            keyframes=keyframes,
+            is_open=served is not None,
+        )
+
+
+def _answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]]:
+    """The questions of `Keys.session`, with what they carry and who answers."""
+    ledger = session.ledger
+    return [
+        ("advance", Advance, session.advance),
+        ("context", ContextRequest, ledger.context),
+        ("candidates", CandidatesRequest, ledger.candidates),
+        ("keyframes", Empty, lambda _: ledger.poses()),
+        ("render", RenderRequest, session.render),
+        ("export", ExportRequest, session.export),
+        ("refine", RefineRequest, session.refine),
+        ("interrupt", Empty, lambda _: session.interrupt()),
+        ("save", SaveRequest, lambda _: session.save()),
+        ("info", Empty, lambda _: session.info()),
+        ("trajectory", TrajectoryRequest, lambda _: ledger.trajectory()),
+    ]
+
+
+def _withdraw(served: _Served, is_saved: bool) -> None:
+    for stop in served.stops:
+        stop()
+    served.session.close(is_saved)
+    served.advances.shutdown(wait=True, cancel_futures=True)
+
+
+def _new_record(request: OpenRequest) -> SessionRecord:
+    if request.calibration is None:
+        raise NotFoundError(f"there is no session {request.session}")
+    if request.mode not in (OFFLINE, LIVE):
+        raise InputError("mode", f"must be {OFFLINE!r} or {LIVE!r}, got {request.mode[:40]!r}")
+    request.calibration.check()
+    return SessionRecord(
+        session=request.session,
+        mode=request.mode,
+        seed=request.seed,
+        epoch=0,
+        created_ns=time.time_ns(),
+        calibration=request.calibration,
+        T_world_first=request.T_world_first,
+    )
+
+
+def _check_same(record: SessionRecord, request: OpenRequest) -> None:
+    """Creating a session again is fine if it means the same: the sender lost the reply."""
+    again = (request.mode, request.seed, codec.pack(request.calibration))
+    if again != (record.mode, record.seed, codec.pack(record.calibration)):
+        raise ConflictError(f"session {request.session} exists with other settings")

@@ -1,0 +1,189 @@
+"""What a session knows apart from its Gaussians: the log, the answered frames, the keyframes."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from services.mapping.keyframes import KeyframeConfig, KeyframeStore
+from services.mapping.log import SessionLog, read_log
+from services.mapping.map_state import MapState
+from services.mapping.pipeline import NewKeyframe
+from services.mapping.snapshot import read_newest
+from services.mapping.storage import SessionFolder
+from shared.errors import ConflictError, InputError
+from shared.frames import Frame
+from shared.maps import Trajectory
+from shared.tracks import (
+    Advance,
+    Candidates,
+    CandidatesRequest,
+    ContextRequest,
+    FrameRecord,
+    KeyframePoses,
+    TrackingContext,
+)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The ledger's part of a snapshot."""
+
+    entries: int
+    keyframes: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """What the map must take up: a snapshot, and the entries behind it."""
+
+    map: MapState | None = None
+    frames: dict[int, Frame] = field(default_factory=dict)  # keyframes of the snapshot
+    later: list[NewKeyframe | None] = field(default_factory=list)
+
+
+class Ledger:
+    """Log, records and keyframe store, always in step with each other; safe from any thread."""
+
+    def __init__(self, folder: SessionFolder, epoch: int, config: KeyframeConfig) -> None:
+        self._lock = threading.Lock()
+        self._records: dict[int, FrameRecord] = {}
+        self._last: FrameRecord | None = None
+        self._store = KeyframeStore(config)
+        self.resumed = self._resume(folder, config)
+        self._log = SessionLog(folder.log_path(epoch))
+
+    def _resume(self, folder: SessionFolder, config: KeyframeConfig) -> Resumed:
+        """Read the newest snapshot and every log."""
+        snapshot = read_newest(folder.path)
+        resumed = Resumed(snapshot.map if snapshot else None)
+        if snapshot:
+            self._store = KeyframeStore.from_state(snapshot.keyframes, config)
+        for path in folder.log_paths():
+            for entry in read_log(path):
+                if snapshot and len(self._records) < snapshot.entries:
+                    self._remember(entry.record)
+                    if entry.frame is not None:
+                        resumed.frames[entry.frame.seq] = entry.frame
+                else:
+                    resumed.later.append(self._apply(entry))
+        return resumed
+
+    def forget_resumed(self) -> None:
+        """Let go of what the map has taken up."""
+        self.resumed = Resumed()
+
+    @property
+    def entries(self) -> int:
+        """Number of answered frames."""
+        return len(self._records)
+
+    @property
+    def last(self) -> FrameRecord | None:
+        """The newest answered frame."""
+        return self._last
+
+    @property
+    def revision(self) -> int:
+        """Grows with every keyframe and correction."""
+        return self._store.revision
+
+    @property
+    def num_landmarks(self) -> int:
+        """ORB points of the map."""
+        return self._store.num_landmarks()
+
+    @property
+    def num_keyframes(self) -> int:
+        """Keyframes of the map."""
+        return len(self._store)
+
+    def holds(self, seq: int) -> bool:
+        """Whether a frame was appended before: the sender did not hear the acknowledgement."""
+        return seq in self._records
+
+    def append(self, entry: Advance) -> NewKeyframe | None:
+        """Log an entry and insert its keyframe; returns what the map must be told.
+
+        Raises:
+            InputError: frame and keyframe data do not belong together.
+            ConflictError: the frame is older than the newest one.
+            StorageError: the disk refused; nothing has changed.
+        """
+        _check(entry)
+        with self._lock:
+            if self._last is not None and entry.record.seq <= self._last.seq:
+                raise ConflictError(f"frame {entry.record.seq} is not newer than {self._last.seq}")
+            self._log.append(entry)
+            return self._apply(entry)
+
+    def _apply(self, entry: Advance) -> NewKeyframe | None:
+        record = entry.record
+        self._remember(record)
+        if entry.frame is None or entry.keyframe is None:
+            return None
+        self._store.insert(record.seq, record.t_ns, record.T_world_camera, entry.keyframe)
+        _, landmarks_world = self._store.landmarks_seen_by(record.seq)
+        return NewKeyframe(entry.frame, self._store.poses(), landmarks_world)
+
+    def _remember(self, record: FrameRecord) -> None:
+        self._records[record.seq] = record
+        self._last = record
+
+    def poses(self) -> KeyframePoses:
+        """Present poses of all keyframes."""
+        with self._lock:
+            return self._store.poses()
+
+    def context(self, request: ContextRequest) -> TrackingContext:
+        """The neighbourhood of a keyframe."""
+        with self._lock:
+            return self._store.context(request.reference_seq)
+
+    def candidates(self, request: CandidatesRequest) -> Candidates:
+        """Keyframes that look like a frame."""
+        with self._lock:
+            return self._store.candidates(request)
+
+    def trajectory(self) -> Trajectory:
+        """All answered frames, with the corrections of their keyframes applied."""
+        with self._lock:
+            records = tuple(self._records.values())
+            poses = self._store.poses()
+        T_world_keyframe = dict(zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True))
+        final = [_final_pose(record, T_world_keyframe) for record in records]
+        return Trajectory(records, np.array(final).reshape(-1, 4, 4), poses.seqs)
+
+    def capture(self) -> Capture:
+        """The store and the place in the log, which is made durable up to there."""
+        with self._lock:
+            self._log.sync()
+            return Capture(self.entries, self._store.state())
+
+    def close(self) -> None:
+        """Close the log."""
+        self._log.close()
+
+
+def count_keyframes(session: Path) -> int:
+    """Keyframes in the logs of a session that nobody has open."""
+    logs = sorted(session.glob("log-*.bin"))
+    return sum(entry.keyframe is not None for path in logs for entry in read_log(path))
+
+
+def _check(entry: Advance) -> None:
+    if (entry.frame is None) != (entry.keyframe is None):
+        raise InputError("keyframe", "a keyframe needs both its frame and its data")
+    if entry.frame is not None and entry.frame.seq != entry.record.seq:
+        raise InputError("frame.seq", f"is {entry.frame.seq}, the record's is {entry.record.seq}")
+
+
+def _final_pose(record: FrameRecord, T_world_keyframe: dict[int, np.ndarray]) -> np.ndarray:
+    if record.seq in T_world_keyframe:
+        return T_world_keyframe[record.seq]
+    if record.reference_seq in T_world_keyframe:
+        return T_world_keyframe[record.reference_seq] @ record.T_reference_camera
+    return record.T_world_camera

@@ -1,0 +1,64 @@
+"""A map's state as named tensors and plain values: what a snapshot holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+@dataclass(frozen=True)
+class MapState:
+    """`tensors` by dotted name; `values` is what JSON can hold."""
+
+    tensors: dict[str, Tensor]
+    values: dict[str, Any]
+
+
+def flatten(groups: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Groups of tensors under the names `group.name`."""
+    return {f"{group}.{name}": t for group, ts in groups.items() for name, t in ts.items()}
+
+
+def unflatten(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """The groups that `flatten` joined."""
+    groups: dict[str, dict[str, Tensor]] = {}
+    for dotted, tensor in tensors.items():
+        group, _, name = dotted.partition(".")
+        groups.setdefault(group, {})[name] = tensor
+    return groups
+
+
+def as_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    """Copies of numpy arrays as tensors."""
+    return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+
+
+def as_arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """Tensors of the host as numpy arrays."""
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
+
+
+def weight_moments(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
+    """Adam's state as `index.moment`; empty before the first step."""
+    return {
+        f"{index}.{moment}": values[moment].cpu().clone()
+        for index, values in optimizer.state_dict()["state"].items()
+        for moment in _MOMENTS
+    }
+
+
+def restore_moments(optimizer: torch.optim.Adam, moments: Mapping[str, Tensor]) -> None:
+    """Put `weight_moments` back."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for dotted, tensor in moments.items():
+        index, _, moment = dotted.partition(".")
+        state.setdefault(int(index), {})[moment] = tensor
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})

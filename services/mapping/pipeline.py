@@ -1,0 +1,284 @@
+"""The mapper: keyframes in, a map of neural Gaussians that renders any view.
+
+It takes values and returns values and never sees the bus; one thread at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from services.mapping import densification
+from services.mapping.anchors import TRAINED, AnchorMap
+from services.mapping.appearance import ExposureModel
+from services.mapping.config import MappingConfig
+from services.mapping.coverage import uncovered_pixels
+from services.mapping.decoder import initial_weights, weight_optimizer
+from services.mapping.losses import Appearance, Target, mapping_loss
+from services.mapping.map_state import (
+    MapState,
+    as_arrays,
+    as_tensors,
+    flatten,
+    restore_moments,
+    unflatten,
+    weight_moments,
+)
+from services.mapping.optimizer import adam_rows, begin_step
+from services.mapping.rasterizer import View, rasterizer_for
+from services.mapping.render import Drawn, Painter, to_reply
+from services.mapping.seeding import SeedRequest, seed_anchors
+from services.mapping.training_views import TrainingView, TrainingViews
+from shared import se3
+from shared.camera import Calibration
+from shared.frames import Frame
+from shared.maps import RenderReply, RenderRequest
+from shared.rectify import RgbdImage
+from shared.telemetry import StageTimes
+from shared.tracks import KeyframePoses
+
+_PSNR_WINDOW = 50  # training views in the running mean
+
+
+@dataclass(frozen=True)
+class NewKeyframe:
+    """A keyframe and what the geometry side of the map says at that moment."""
+
+    frame: Frame
+    poses: KeyframePoses  # of all keyframes, this one included
+    landmarks_world: NDArray[np.float64]  # [L, 3], ORB points that it saw
+
+    @property
+    def T_world_camera(self) -> NDArray[np.float64]:
+        """The keyframe's own pose, [4, 4]."""
+        return self.poses.T_world_keyframes[self.poses.seqs == self.frame.seq][0]
+
+
+@dataclass(frozen=True)
+class MapFigures:
+    """What a map amounts to, in numbers."""
+
+    anchors: int
+    primary: int
+    iterations: int
+    psnr_db: float | None
+    num_bytes: int  # anchors and networks, without optimizer state
+
+    @staticmethod
+    def of(mapper: Mapper) -> MapFigures:
+        """The figures of a mapper at this moment."""
+        weights = sum(weight.numel() * 4 for weight in mapper.weights.values())
+        return MapFigures(
+            anchors=len(mapper.anchors),
+            primary=mapper.anchors.num_primary,
+            iterations=mapper.iterations,
+            psnr_db=mapper.psnr_db,
+            num_bytes=mapper.anchors.num_bytes + weights,
+        )
+
+
+class Mapper:
+    """The anchor map of one session with its networks, optimizer and training views."""
+
+    def __init__(
+        self, calibration: Calibration, config: MappingConfig, seed: int, device: torch.device
+    ) -> None:
+        self.config = config
+        self._device = device
+        self.anchors = AnchorMap(config.anchors, device)
+        weights = initial_weights(config.anchors, config.decoder, seed)
+        self.weights = {name: w.to(device).requires_grad_() for name, w in weights.items()}
+        self._weight_optimizer = weight_optimizer(self.weights, config.rates)
+        self.painter = Painter(
+            self.anchors, self.weights, rasterizer_for(device.type), config.decoder
+        )
+        self.exposures = ExposureModel(config.rates)
+        self.views = TrainingViews(
+            calibration, config.schedule, seed, lambda image: Target.of(image, device)
+        )
+        self._placed: dict[int, NDArray[np.float64]] = {}  # poses that the anchors are placed by
+        self._rng = np.random.default_rng([seed, 0])
+        self._background = np.zeros(3, np.float32)
+        self.iterations = 0
+        self.revision = 0
+        self.stages = StageTimes()
+        self._squared_errors: deque[float] = deque(maxlen=_PSNR_WINDOW)
+
+    @property
+    def psnr_db(self) -> float | None:
+        """Mean PSNR of the last training views, None before the first."""
+        if not self._squared_errors:
+            return None
+        errors = np.maximum(np.array(self._squared_errors), 1e-10)
+        return float(np.mean(-10.0 * np.log10(errors)))
+
+    def insert_keyframe(self, keyframe: NewKeyframe) -> int:
+        """Seed the map where a new keyframe shows what the map lacks; returns new anchors.
+
+        "When the current frame is determined to be a keyframe, we add new anchor points to the
+        map based on the ORB feature points and their corresponding depth information", secondary
+        ones "only to non-overlapping regions of the new keyframe".
+
+        Raises:
+            InputError: an image of the keyframe cannot be decoded.
+        """
+        with self.stages.stage("insert_keyframe"):
+            self._follow_corrections(keyframe.poses)
+            image = self._add_view(keyframe)
+            pose, config = keyframe.T_world_camera, self.config.anchors
+            is_uncovered = uncovered_pixels(self.painter, image, pose, config)
+            request = SeedRequest(image, pose, is_uncovered, keyframe.landmarks_world)
+            new = seed_anchors(request, self.anchors.keys(), config, self._rng)
+            self.revision = keyframe.poses.revision
+            return self.anchors.append(new, keyframe.frame.seq)
+
+    def iterate(self, count: int = 1) -> None:
+        """Optimise on so many draws of keyframes (paper Eq. 8); nothing without keyframes."""
+        for _ in range(count if len(self.views) else 0):
+            self._step(self.views.draw(), rate=1.0)
+
+    def refine(self, progress: float) -> None:
+        """One iteration of a refinement, at 0 <= `progress` < 1 of it; rates decay with it."""
+        if len(self.views):
+            decay = self.config.rates.refinement_decay
+            self._step(self.views.draw_in_rounds(), rate=decay**progress)
+
+    def render(self, request: RenderRequest) -> RenderReply:
+        """A view of the map, with the exposure of a time or the mean one."""
+        view = View(se3.inverse(request.T_world_camera), request.intrinsics)
+        exposure = torch.from_numpy(self.exposures.at(request.appearance_t_ns))
+        appearance = self._appearance(exposure.to(self._device))
+        return to_reply(self.painter.draw(view), appearance, self.revision)
+
+    def state(self) -> MapState:
+        """Everything that a snapshot needs to go on exactly as if nothing had happened."""
+        groups = {
+            "anchors": self.anchors.state(),
+            "weights": {name: w.detach().cpu().clone() for name, w in self.weights.items()},
+            "adam": weight_moments(self._weight_optimizer),
+            "exposures": as_tensors(self.exposures.state()),
+            "mapper": as_tensors(
+                {
+                    "background": self._background,
+                    "placed_seqs": np.array(list(self._placed), np.int64),
+                    "placed": np.array(list(self._placed.values())).reshape(-1, 4, 4),
+                    "squared_errors": np.array(self._squared_errors, np.float64),
+                }
+            ),
+        }
+        values = {
+            "iterations": self.iterations,
+            "revision": self.revision,
+            "generator": self._rng.bit_generator.state,
+            "views": self.views.state(),
+        }
+        return MapState(flatten(groups), values)
+
+    def restore(self, state: MapState, frames: Mapping[int, Frame]) -> None:
+        """Take up a `state()`; `frames` has at least the keyframes that it names."""
+        groups = unflatten(state.tensors)
+        self.anchors.restore(groups["anchors"])
+        with torch.no_grad():
+            for name, weight in self.weights.items():
+                weight.copy_(groups["weights"][name])
+        restore_moments(self._weight_optimizer, groups.get("adam", {}))
+        self.exposures.restore(as_arrays(groups["exposures"]))
+        mapper = as_arrays(groups["mapper"])
+        self._background = mapper["background"].copy()
+        self._placed = dict(zip(mapper["placed_seqs"].tolist(), mapper["placed"], strict=True))
+        self._squared_errors.extend(mapper["squared_errors"].tolist())
+        self.iterations = state.values["iterations"]
+        self.revision = state.values["revision"]
+        self._rng.bit_generator.state = state.values["generator"]
+        self.views.restore(state.values["views"], frames)
+
+    def _step(self, keyframe: TrainingView, rate: float) -> None:
+        """One optimisation step on one keyframe."""
+        with self.stages.stage("target"):
+            target = self.views.target(keyframe.seq)
+        exposure = torch.from_numpy(self.exposures.of(keyframe.seq)).to(self._device)
+        appearance = self._appearance(exposure.requires_grad_())
+        with self.stages.stage("iteration"):
+            drawn = self._draw(keyframe, target)
+            with self.stages.stage("loss"):
+                loss = mapping_loss(drawn.rendered, target, appearance, self.config.loss)
+            with self.stages.stage("backward"):
+                loss.total.backward()
+            with self.stages.stage("update"):
+                self._update(drawn, rate)
+                assert exposure.grad is not None
+                self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rate)
+            self._densify(drawn)
+        self._squared_errors.append(float(loss.squared_error))
+
+    def _draw(self, keyframe: TrainingView, target: Target) -> Drawn:
+        view = View(se3.inverse(keyframe.T_world_camera), target.intrinsics)
+        with self.stages.stage("decode"):
+            visible, gaussians = self.painter.decode(view, is_trained=True)
+        with self.stages.stage("rasterize"):
+            return Drawn(visible, gaussians, self.painter.rasterizer(gaussians, view))
+
+    @torch.no_grad()
+    def _update(self, drawn: Drawn, rate: float) -> None:
+        """Adam over the visible anchors and the networks."""
+        step = begin_step(self.anchors.rows, drawn.visible.index)
+        for name in TRAINED:
+            gradient = getattr(drawn.visible, name).grad
+            own = getattr(self.config.rates, name)
+            adam_rows(step, name, gradient, rate * own)
+        for group in self._weight_optimizer.param_groups:
+            group["lr"] = rate * group["base_rate"]
+        self._weight_optimizer.step()
+        self._weight_optimizer.zero_grad()
+
+    @torch.no_grad()
+    def _densify(self, drawn: Drawn) -> None:
+        """Grow where the screen gradient stays large, cull what hardly shows."""
+        config = self.config.densification
+        self.iterations += 1
+        densification.record(
+            self.anchors,
+            drawn.visible.index,
+            drawn.gaussians.opacities,
+            drawn.rendered.screen.gradient_norm,
+        )
+        if self.iterations % config.cull_interval == 0:
+            densification.cull(self.anchors, config)
+        is_grown = self.iterations >= config.first_iteration
+        if is_grown and self.iterations % config.grow_interval == 0:
+            densification.grow(self.anchors, config, self.config.anchors, self._rng)
+
+    def _follow_corrections(self, poses: KeyframePoses) -> None:
+        """Where a keyframe was corrected, its anchors go with it."""
+        for seq, T_new in zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True):
+            if seq not in self.views:
+                continue
+            self.views.set_pose(seq, T_new)
+            T_new_old = T_new @ se3.inverse(self._placed[seq])
+            shift = float(np.linalg.norm(T_new[:3, 3] - self._placed[seq][:3, 3]))
+            turn = math.degrees(se3.angle_rad(T_new_old))
+            schedule = self.config.schedule
+            if shift > schedule.min_shift_m or turn > schedule.min_turn_deg:
+                self.anchors.move(seq, T_new_old)
+                self._placed[seq] = T_new
+
+    def _add_view(self, keyframe: NewKeyframe) -> RgbdImage:
+        frame = keyframe.frame
+        view = TrainingView(frame.seq, frame.t_ns, frame, keyframe.T_world_camera)
+        self.views.add(view)
+        self._placed[frame.seq] = keyframe.T_world_camera
+        image = self.views.image(frame.seq)
+        self.exposures.add(frame.seq, frame.t_ns)
+        mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
+        self._background += (mean - self._background) / len(self.views)
+        return image
+
+    def _appearance(self, exposure: Tensor) -> Appearance:
+        return Appearance(torch.from_numpy(self._background).to(self._device), exposure)

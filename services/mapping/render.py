@@ -1,0 +1,98 @@
+"""Views of the map: which anchors a camera needs, their Gaussians, and the rendered images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from services.mapping.anchors import AnchorMap
+from services.mapping.config import DecoderConfig
+from services.mapping.decoder import VisibleAnchors, Weights, decode
+from services.mapping.decoder_cpu import decode_cpu
+from services.mapping.losses import Appearance
+from services.mapping.rasterizer import Gaussians, Rasterizer, Rendered, View
+from shared.maps import RenderReply
+
+MIN_DEPTH_M = 0.2
+MARGIN_PX = 24.0  # an anchor's children reach into the image from outside
+_MIN_ALPHA = 0.5 / 255.0
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A rendered view with all that led to it."""
+
+    visible: VisibleAnchors
+    gaussians: Gaussians
+    rendered: Rendered
+
+
+@dataclass(frozen=True)
+class Painter:
+    """The map's parts that drawing needs."""
+
+    anchors: AnchorMap
+    weights: Weights
+    rasterizer: Rasterizer
+    config: DecoderConfig
+
+    def decode(self, view: View, is_trained: bool) -> tuple[VisibleAnchors, Gaussians]:
+        """The Gaussians of the anchors in a view (Eq. 4 to 6)."""
+        index = visible_index(self.anchors, view, self.config.max_visible_anchors)
+        visible = VisibleAnchors.gather(self.anchors, index, is_trained)
+        camera = torch.from_numpy(camera_world(view)).to(visible.positions)
+        function = decode_cpu if index.device.type == "cpu" else decode
+        return visible, function(visible, camera, self.weights)
+
+    @torch.no_grad()
+    def draw(self, view: View) -> Drawn:
+        """Render without gradients."""
+        visible, gaussians = self.decode(view, is_trained=False)
+        return Drawn(visible, gaussians, self.rasterizer(gaussians, view))
+
+
+def camera_world(view: View) -> np.ndarray:
+    """Position of a view's camera in the world, [3]."""
+    T = np.asarray(view.T_camera_world)
+    return -T[:3, :3].T @ T[:3, 3]
+
+
+def visible_index(anchors: AnchorMap, view: View, limit: int) -> Tensor:
+    """Rows of the anchors inside a view, ascending; the nearest `limit` if there are more."""
+    T = torch.from_numpy(np.asarray(view.T_camera_world)).to(anchors.rows["position"])
+    points = anchors.rows["position"] @ T[:3, :3].T + T[:3, 3]
+    depth = points[:, 2].clamp_min(1e-6)
+    k = view.intrinsics
+    u = points[:, 0] / depth * k.fx + k.cx
+    v = points[:, 1] / depth * k.fy + k.cy
+    is_inside = points[:, 2] > MIN_DEPTH_M
+    is_inside &= (u > -MARGIN_PX) & (u < k.width + MARGIN_PX)
+    is_inside &= (v > -MARGIN_PX) & (v < k.height + MARGIN_PX)
+    index = is_inside.nonzero()[:, 0]
+    if len(index) > limit:
+        index = index[depth[index].argsort(stable=True)[:limit]].sort().values
+    return index
+
+
+def to_reply(drawn: Drawn, appearance: Appearance, revision: int) -> RenderReply:
+    """8-bit colour, depth along the axis, and alpha; a view of nothing is black."""
+    rendered = drawn.rendered
+    alpha = rendered.alpha.clamp(0.0, 1.0)
+    image = appearance.apply(rendered.colour, alpha).clamp(0.0, 1.0)
+    if len(drawn.visible.index) == 0:
+        image = torch.zeros_like(image)
+    is_drawn = alpha > _MIN_ALPHA
+    depth = torch.where(is_drawn, rendered.depth / alpha.clamp_min(_MIN_ALPHA), 0.0)
+    return RenderReply(
+        revision=revision,
+        rgb=_bytes(image),
+        depth_m=depth.cpu().numpy(),
+        alpha=_bytes(alpha),
+    )
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image * 255.0).round().to(torch.uint8).cpu().numpy()

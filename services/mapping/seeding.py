@@ -1,0 +1,165 @@
+"""New anchors from a keyframe: measured depth grouped by voxel; voxels of ORB points are primary.
+
+Every child starts on a measured point with that pixel's colour, so that a map is good after a few
+iterations (zero offsets, the literal reading, were measured 0.95 dB worse).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.mapping.anchors import FEATURES, NewAnchors
+from services.mapping.config import AnchorConfig
+from services.mapping.voxels import centres, levels_at, sizes_m, voxel_keys
+from shared.rectify import RgbdImage
+from shared.se3 import inverse, transform
+
+_COLOUR_MARGIN = 0.02  # logits of pure black and white would be infinite
+
+
+@dataclass(frozen=True)
+class SeedRequest:
+    """A keyframe, and what of it the map lacks."""
+
+    image: RgbdImage
+    T_world_camera: NDArray[np.float64]  # [4, 4]
+    is_uncovered: NDArray[np.bool_]  # [H, W], pixels that the map does not explain
+    landmarks_world: NDArray[np.float64]  # [L, 3], ORB points of the keyframe
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Depth samples, sorted by voxel."""
+
+    keys: NDArray[np.int64]  # [P]
+    points_world: NDArray[np.float32]  # [P, 3]
+    colours: NDArray[np.float32]  # [P, 3]
+    depths: NDArray[np.float32]  # [P]
+    levels: NDArray[np.int64]  # [P]
+
+
+def seed_anchors(
+    request: SeedRequest,
+    taken: NDArray[np.int64],
+    config: AnchorConfig,
+    rng: np.random.Generator,
+) -> NewAnchors:
+    """Anchors for the uncovered depth and for the ORB points of a keyframe.
+
+    Args:
+        taken: keys of voxels that have an anchor already, [N].
+        rng: jitters the samples inside their pixels.
+    """
+    landmark_keys = _landmark_keys(request, config)
+    samples = _samples(request, landmark_keys, config, rng)
+    starts, counts = _free_voxels(samples, taken, landmark_keys, config)
+    picks = _pick_children(starts, counts, config.children)
+    levels = samples.levels[starts]
+    positions = centres(samples.points_world[starts], levels, config)
+    sides = sizes_m(levels, config)
+    spacing = samples.depths[starts] / np.float32(request.image.intrinsics.fx)
+    offsets = (samples.points_world[picks] - positions[:, None]) / sides[:, None, None]
+    offsets += _repeat_jitter(counts, spacing / sides, config.children, rng)
+    return NewAnchors(
+        positions=positions,
+        features=_features(samples.colours[picks], rng),
+        offsets=offsets.reshape(len(starts), -1).astype(np.float32),
+        scalings=_scalings(sides, spacing, counts, config),
+        keys=samples.keys[starts],
+        is_primary=np.isin(samples.keys[starts], landmark_keys),
+    )
+
+
+def _landmark_keys(request: SeedRequest, config: AnchorConfig) -> NDArray[np.int64]:
+    points = request.landmarks_world.reshape(-1, 3)
+    depths = transform(inverse(request.T_world_camera), points)[:, 2]
+    in_front = depths > 0.0
+    return voxel_keys(points[in_front], levels_at(depths[in_front], config), config)
+
+
+def _samples(
+    request: SeedRequest,
+    landmark_keys: NDArray[np.int64],
+    config: AnchorConfig,
+    rng: np.random.Generator,
+) -> _Samples:
+    """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
+    image, camera = request.image, request.image.intrinsics
+    rows, columns = np.nonzero(image.depth_m > 0.0)
+    order = rng.permutation(len(rows))
+    rows, columns = rows[order], columns[order]
+    depths = image.depth_m[rows, columns]
+    # A sample stands for its whole pixel, whose centre is at the whole number.
+    u = columns + rng.uniform(-0.5, 0.5, len(rows))
+    v = rows + rng.uniform(-0.5, 0.5, len(rows))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1)
+    points = transform(request.T_world_camera, rays * depths[:, None])
+    levels = levels_at(depths, config)
+    keys = voxel_keys(points, levels, config)
+    wanted = np.flatnonzero(request.is_uncovered[rows, columns] | np.isin(keys, landmark_keys))
+    wanted = wanted[np.argsort(keys[wanted], kind="stable")]
+    return _Samples(
+        keys=keys[wanted],
+        points_world=points[wanted].astype(np.float32),
+        colours=image.rgb[rows[wanted], columns[wanted]].astype(np.float32) / 255.0,
+        depths=depths[wanted],
+        levels=levels[wanted],
+    )
+
+
+def _free_voxels(
+    samples: _Samples,
+    taken: NDArray[np.int64],
+    landmark_keys: NDArray[np.int64],
+    config: AnchorConfig,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First sample and number of samples of each voxel that gets an anchor."""
+    keys, starts, counts = np.unique(samples.keys, return_index=True, return_counts=True)
+    is_supported = (counts >= config.min_samples) | np.isin(keys, landmark_keys)
+    is_free = is_supported & ~np.isin(keys, taken)
+    return starts[is_free], counts[is_free]
+
+
+def _pick_children(
+    starts: NDArray[np.int64], counts: NDArray[np.int64], children: int
+) -> NDArray[np.int64]:
+    """A sample for each child, spread over the voxel's samples and repeated if too few, [A, k]."""
+    child = np.arange(children)
+    spread = (child * counts[:, None]) // children
+    return starts[:, None] + np.where(counts[:, None] >= children, spread, child % counts[:, None])
+
+
+def _repeat_jitter(
+    counts: NDArray[np.int64],
+    spacing: NDArray[np.float32],
+    children: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Half a sample's spacing of noise for children on a sample that another child has too."""
+    is_repeated = np.arange(children) >= counts[:, None]
+    noise = rng.normal(0.0, 0.5, (len(counts), children, 3))
+    return noise * (is_repeated * spacing[:, None])[..., None]
+
+
+def _features(colours: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The children's logit colours, then noise for the networks to tell anchors apart, [A, 32]."""
+    count, children = colours.shape[:2]
+    features = rng.normal(0.0, 0.1, (count, FEATURES)).astype(np.float32)
+    clipped = np.clip(colours, _COLOUR_MARGIN, 1.0 - _COLOUR_MARGIN)
+    features[:, : 3 * children] = np.log(clipped / (1.0 - clipped)).reshape(count, -1)
+    return features
+
+
+def _scalings(
+    sides: NDArray[np.float32],
+    spacing: NDArray[np.float32],
+    counts: NDArray[np.int64],
+    config: AnchorConfig,
+) -> NDArray[np.float32]:
+    """Log of the offsets' unit and of twice the children's sigma (the networks start at half)."""
+    share = np.sqrt(counts / np.minimum(config.children, counts))
+    sigma = config.initial_sigma * share * spacing
+    return np.log(np.stack([sides] * 3 + [2.0 * sigma] * 3, axis=1)).astype(np.float32)

@@ -1,0 +1,206 @@
+"""The owner of one session: its ledger, its map, and the answers that both give."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from services.mapping.config import MappingConfig
+from services.mapping.export import chunks, export_ply, pack_folder
+from services.mapping.ledger import Ledger
+from services.mapping.mesh import export_mesh
+from services.mapping.pipeline import MapFigures, Mapper
+from services.mapping.snapshot import Snapshot, write_snapshot
+from services.mapping.storage import SessionFolder
+from services.mapping.worker import MapWorker
+from shared.errors import InputError, PointSlamError
+from shared.maps import (
+    ExportChunk,
+    ExportFormat,
+    ExportRequest,
+    JobStatus,
+    MapInfo,
+    RefineRequest,
+    RenderReply,
+    RenderRequest,
+    SaveReply,
+)
+from shared.tracks import Advance, AdvanceReply, KeyframePoses, OpenReply
+
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a session needs of the process it runs in."""
+
+    mapper: str  # the process's name
+    config: MappingConfig
+    device: torch.device
+    publish: Callable[[str, KeyframePoses], None]  # session, poses
+
+
+class Session:
+    """One session's map; its methods may be called from any thread, `advance` from one."""
+
+    def __init__(self, folder: SessionFolder, surroundings: Surroundings) -> None:
+        self._folder = folder
+        self._surroundings = surroundings
+        config = surroundings.config
+        self.record = folder.take_up()
+        self.ledger = Ledger(folder, self.record.epoch, config.keyframes)
+        self._saved_entries = 0
+        mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
+        self._worker = MapWorker(mapper, self.record.mode, config)
+        self._take_up(mapper)
+        self._calm = threading.Lock()  # held while a snapshot wants no new entries
+        self._saving = threading.Lock()
+        self._is_closed = threading.Event()
+        self._saver = threading.Thread(target=self._save_now_and_then, daemon=True)
+        self._worker.start()
+        self._saver.start()
+
+    def _take_up(self, mapper: Mapper) -> None:
+        resumed = self.ledger.resumed
+        if resumed.map is not None:
+            mapper.restore(resumed.map, resumed.frames)
+            self._saved_entries = self.ledger.entries - len(resumed.later)
+        for keyframe in resumed.later:
+            self._worker.submit(keyframe)
+        self.ledger.forget_resumed()
+
+    def opening(self) -> OpenReply:
+        """What whoever opens the session is told."""
+        record = self.record
+        return OpenReply(
+            session=record.session,
+            mapper=self._surroundings.mapper,
+            epoch=record.epoch,
+            mode=record.mode,
+            map_revision=self.ledger.revision,
+            created_ns=record.created_ns,
+            calibration=record.calibration,
+            T_world_first=record.T_world_first,
+            last=self.ledger.last,
+            keyframe_poses=self.ledger.poses(),
+        )
+
+    def advance(self, entry: Advance) -> AdvanceReply:
+        """Log an answered frame; its keyframe is in contexts and on disk when this returns.
+
+        The Gaussians follow in the queue; offline the reply waits while that is too long. A
+        frame that was appended before is acknowledged again.
+
+        Raises:
+            InputError, ConflictError, StorageError: as `Ledger.append`.
+        """
+        with self._calm:
+            if not self.ledger.holds(entry.record.seq):
+                keyframe = self.ledger.append(entry)
+                self._worker.submit(keyframe)
+                if keyframe is not None:
+                    self._surroundings.publish(self.record.session, keyframe.poses)
+        self._worker.wait_for_room()
+        return AdvanceReply(entry.record.seq, self.ledger.revision)
+
+    def render(self, request: RenderRequest) -> RenderReply:
+        """A view of the map; waits for one iteration at most.
+
+        Raises:
+            InputError: the view is no camera.
+        """
+        request.intrinsics.check("intrinsics")
+        if request.T_world_camera.shape != (4, 4) or not np.isfinite(request.T_world_camera).all():
+            raise InputError("T_world_camera", "must be 4x4 finite numbers")
+        return self._worker.visit(lambda mapper: mapper.render(request))
+
+    def export(self, request: ExportRequest) -> Iterator[ExportChunk]:
+        """The map as a file, in pieces."""
+        size = self._surroundings.config.owner.chunk_bytes
+        if request.format is ExportFormat.SNAPSHOT:
+            self.save()
+            return chunks(pack_folder(self._folder.path), size)
+        if request.format is ExportFormat.MESH:
+            return chunks(export_mesh(self._worker.visit), size)
+        return chunks(self._worker.visit(export_ply), size)
+
+    def refine(self, request: RefineRequest) -> JobStatus:
+        """Start a refinement over all keyframes."""
+        return self._worker.refine(request.iterations)
+
+    def interrupt(self) -> JobStatus:
+        """End a refinement."""
+        return self._worker.interrupt()
+
+    def save(self) -> SaveReply:
+        """Write a snapshot of the session when all its entries are in the map.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        with self._saving:
+            with self._calm:
+                self._worker.drain()
+                capture = self.ledger.capture()
+                revision = self.ledger.revision
+                state = self._worker.visit(lambda mapper: mapper.state())
+            snapshot = Snapshot(capture.entries, state, capture.keyframes)
+            size = write_snapshot(self._folder.path, snapshot)
+            self._saved_entries = capture.entries
+        return SaveReply(revision, size)
+
+    def info(self) -> MapInfo:
+        """The state of the map."""
+        times, ledger = self._worker.times, self.ledger
+        stages = self._worker.stages_ms
+        figures = self._worker.visit(MapFigures.of)
+        return MapInfo(
+            session=self.record.session,
+            mapper=self._surroundings.mapper,
+            epoch=self.record.epoch,
+            mode=self.record.mode,
+            map_revision=ledger.revision,
+            frames=ledger.entries,
+            keyframes=ledger.num_keyframes,
+            landmarks=ledger.num_landmarks,
+            pending=self._worker.pending,
+            refinement=self._worker.job,
+            stages_ms=stages,
+            iteration_ms=stages.get("iteration"),
+            mapping_s=times.mapping_s,
+            refinement_s=times.refinement_s,
+            device=str(self._surroundings.device),
+            primary_anchors=figures.primary,
+            secondary_anchors=figures.anchors - figures.primary,
+            iterations=figures.iterations,
+            psnr_db=figures.psnr_db,
+            map_bytes=figures.num_bytes,
+        )
+
+    def close(self, is_saved: bool = True) -> None:
+        """End the session's threads; with a snapshot unless nothing is new."""
+        self._is_closed.set()
+        self._saver.join()
+        if is_saved and self.ledger.entries:
+            self._try_to_save()
+        self._worker.stop()
+        self.ledger.close()
+        self._folder.close()
+
+    def _save_now_and_then(self) -> None:
+        interval_s = self._surroundings.config.owner.snapshot_interval_s
+        while not self._is_closed.wait(interval_s):
+            if self.ledger.entries > self._saved_entries:
+                self._try_to_save()
+
+    def _try_to_save(self) -> None:
+        try:
+            reply = self.save()
+            LOGGER.info("%s: snapshot of %d bytes", self.record.session, reply.bytes)
+        except PointSlamError as error:
+            LOGGER.error("%s: no snapshot: %s", self.record.session, error)
