@@ -87,17 +87,20 @@ class RefinementConfig:
     rounds: int = 3
     iterations: int = 5
     outlier_chi2: float = 9.0
-    min_observations: int = 10
+    max_relinearisations: int = 4  # of matches and registration around the refined pose
 
     def __post_init__(self) -> None:
-        _require_positive(self, "pixel_sigma", "huber_sigma", "rounds", "iterations")
+        _require_positive(self, "pixel_sigma", "huber_sigma", "rounds", "max_relinearisations")
 
 
 @dataclass(frozen=True)
 class VerificationConfig:
     """When a pose is believed."""
 
-    sure_inliers: int = 40  # enough of both and nothing else is tried
+    sure_inliers: int = 100  # enough of these, and nothing else is tried
+    sure_inliers_near: int = 40  # where the pose is about what was predicted
+    near_step_m: float = 0.05
+    near_step_deg: float = 3.0
     sure_agreement: float = 0.85
     min_inliers: int = 15
     min_inlier_share: float = 0.25
@@ -106,7 +109,7 @@ class VerificationConfig:
     depth_tolerance_m: float = 0.03
     depth_tolerance_per_m2: float = 0.01
     coarse_min_agreement: float = 0.85  # without features
-    coarse_min_overlap: float = 0.5
+    coarse_min_overlap: float = 0.08
     max_step_m: float = 1.0
     max_step_deg: float = 50.0
 

@@ -16,7 +16,11 @@ from services.tracking.registration import Registration, align, linearise
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Agreement, depth_agreement
 from shared.rectify import RgbdImage
+from shared.se3 import angle_rad, inverse
 from shared.tracks import NO_LANDMARK, PointCloud
+
+_SAME_M = 5e-4
+_SAME_RAD = 5e-4
 
 
 @dataclass(frozen=True)
@@ -74,18 +78,21 @@ def attempt(
     with clock.stage("coarse"):
         registration = align(observed.cloud, local.voxels, T_start, config.registration)
     with clock.stage("refine"):
-        refinement, matches = _refine(observed, local, registration, config)
-        registration = linearise(
-            observed.cloud,
-            local.voxels.levels[-1],
-            refinement.T_world_camera,
-            config.registration,
-        )
-        refinement, matches = _refine(observed, local, registration, config)
+        for _ in range(config.refinement.max_relinearisations):
+            refinement, matches = _refine(observed, local, registration, config)
+            step = inverse(registration.T_world_camera) @ refinement.T_world_camera
+            registration = linearise(
+                observed.cloud,
+                local.voxels.levels[-1],
+                refinement.T_world_camera,
+                config.registration,
+            )
+            if _is_small(step):
+                break
         agreement = depth_agreement(
             observed.image,
             local.context.cloud_world,
-            refinement.T_world_camera,
+            registration.T_world_camera,
             config.verification,
         )
     return Estimate(
@@ -97,6 +104,11 @@ def attempt(
         num_matches=len(matches),
         local=local,
     )
+
+
+def _is_small(step: NDArray[np.float64]) -> bool:
+    """Whether correspondences would stay the same after this step."""
+    return float(np.linalg.norm(step[:3, 3])) < _SAME_M and angle_rad(step) < _SAME_RAD
 
 
 def _refine(

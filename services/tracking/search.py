@@ -16,6 +16,7 @@ from services.tracking.relocalization import locate
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import is_possible_step
 from shared.frames import TrackingStatus, TrackRequest
+from shared.se3 import angle_rad, inverse
 from shared.tracks import CandidatesRequest
 
 
@@ -68,8 +69,10 @@ def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
     prior = job.request.prior
     if prior is None:
         return None
-    first = job.attempt(local, predict(prior, job.request.frame))
-    if is_sure(first, job.config.verification):
+    predicted = predict(prior, job.request.frame)
+    first = job.attempt(local, predicted)
+    config = job.config.verification
+    if is_sure(first, config) or is_as_predicted(first, predicted, config):
         return first
     starts = [job.locate(local), prior.T_world_camera.copy()]
     others = [job.attempt(local, T) for T in starts if T is not None]
@@ -91,9 +94,25 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
 
 def is_sure(estimate: Estimate, config: VerificationConfig) -> bool:
     """Features and depth agree so well that nothing else needs to be tried."""
+    return estimate.inliers >= config.sure_inliers and _agrees(estimate, config)
+
+
+def is_as_predicted(
+    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
+) -> bool:
+    """About where it was expected, which takes fewer features to be sure of."""
+    step = inverse(T_predicted) @ estimate.T_world_camera
     return (
-        estimate.inliers >= config.sure_inliers
-        and estimate.agreement.share >= config.sure_agreement
+        estimate.inliers >= config.sure_inliers_near
+        and float(np.linalg.norm(step[:3, 3])) <= config.near_step_m
+        and np.degrees(angle_rad(step)) <= config.near_step_deg
+        and _agrees(estimate, config)
+    )
+
+
+def _agrees(estimate: Estimate, config: VerificationConfig) -> bool:
+    return (
+        estimate.agreement.share >= config.sure_agreement
         and estimate.inlier_share >= config.min_inlier_share
     )
 
