@@ -55,7 +55,7 @@ def render(gaussians: Gaussians, view: View) -> Reference:
         colour=weights @ gaussians.colours[screen.order],
         depth=weights @ screen.depths,
         alpha=weights.sum(-1),
-        screen=ScreenStatistics(_is_visible(len(gaussians.means), screen, alpha)),
+        screen=_statistics(len(gaussians.means), screen, alpha),
     )
     return Reference(rendered, _is_decided(values, before, after))
 
@@ -111,10 +111,21 @@ def _exponents(screen: _Screen, height: int, width: int) -> Tensor:
     return -0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b)
 
 
-def _is_visible(count: int, screen: _Screen, alpha: Tensor) -> Tensor:
+def _statistics(count: int, screen: _Screen, alpha: Tensor) -> ScreenStatistics:
+    """Which Gaussians touch a pixel; the gradient norm follows with the backward pass."""
     visible = torch.zeros(count, dtype=torch.bool)
     visible[screen.order] = (alpha > 0).flatten(0, 1).any(0)
-    return visible
+    statistics = ScreenStatistics(visible)
+    half_size = torch.tensor([alpha.shape[1], alpha.shape[0]]) / 2.0
+
+    def note(gradient: Tensor) -> None:
+        norms = torch.zeros(count, dtype=gradient.dtype)
+        norms[screen.order] = (gradient * half_size).norm(dim=-1)
+        statistics.gradient_norm = norms
+
+    if screen.means_px.requires_grad:
+        screen.means_px.register_hook(note)
+    return statistics
 
 
 def _is_decided(values: Tensor, before: Tensor, after: Tensor) -> Tensor:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import llvmlite.ir as ir
@@ -26,26 +28,36 @@ intrinsic: Any = extending.intrinsic
 infer_global: Any = templates.infer_global
 
 # No "nnan" and "ninf": lanes outside an ellipse may overflow, and a select drops them.
-_FAST_MATH = ("contract", "reassoc", "nsz", "arcp")
+FAST_MATH = ("contract", "reassoc", "nsz", "arcp")
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
-    "cache": True,
-    "fastmath": set(_FAST_MATH),
+    "fastmath": set(FAST_MATH),
     "error_model": "numpy",
     "boundscheck": False,
 }
 
 _FLOAT = ir.FloatType()
 _INT32 = ir.IntType(32)
-_INT64 = ir.IntType(64)
 float8_ir = ir.VectorType(_FLOAT, LANES)
 _INTS = ir.VectorType(_INT32, LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
 
 
 def kernel(function: Callable) -> Any:
-    """Compile a function that Python calls; it runs without the interpreter lock."""
-    return njit(**_OPTIONS)(function)
+    """Compile a function that Python calls; it runs without the interpreter lock.
+
+    The compiled code is cached on disk. Numba would renew it only when the function's own file
+    changes, and not when what it inlines does: the stamp covers this whole folder.
+    """
+    dispatcher: Any = njit(cache=True, **_OPTIONS)(function)
+    cache_file = dispatcher._cache._cache_file
+    cache_file._source_stamp = (cache_file._source_stamp, _newest_source_ns())
+    return dispatcher
+
+
+@cache
+def _newest_source_ns() -> int:
+    return max(path.stat().st_mtime_ns for path in Path(__file__).parent.glob("*.py"))
 
 
 def inlined(function: Callable) -> Any:
@@ -87,7 +99,7 @@ def _constant(numba_type: ir.Type, values: Any) -> ir.Constant:
     return ir.Constant(numba_type, values)
 
 
-def _shuffle(builder, x, y, order: list[int]):
+def shuffle(builder, x, y, order: list[int]):
     return builder.shuffle_vector(x, y, _constant(_INTS, order))
 
 
@@ -97,7 +109,7 @@ def _as_float8(context, builder, numba_type, value):
         return value
     undefined = _constant(float8_ir, ir.Undefined)
     number = context.cast(builder, value, numba_type, types.float32)
-    return _shuffle(
+    return shuffle(
         builder, builder.insert_element(undefined, number, _INT32(0)), undefined, [0] * LANES
     )
 
@@ -135,7 +147,7 @@ def _define_binary(operation: Callable, result: types.Type, emit: Callable) -> N
 
 
 def _arithmetic(name: str) -> Callable:
-    return lambda builder, x, y: getattr(builder, name)(x, y, flags=_FAST_MATH)
+    return lambda builder, x, y: getattr(builder, name)(x, y, flags=FAST_MATH)
 
 
 def _comparison(sign: str) -> Callable:
@@ -238,89 +250,3 @@ def square_root(typing_context, x):
         )
 
     return float8(x), generate
-
-
-@intrinsic
-def any_lane(typing_context, mask):
-    """Whether the mask holds anywhere."""
-
-    def generate(context, builder, sig, args):
-        bits = ir.IntType(LANES)
-        return builder.icmp_unsigned("!=", builder.bitcast(args[0], bits), bits(0))
-
-    return types.boolean(mask), generate
-
-
-@intrinsic
-def lane(typing_context, vector, index):
-    """One lane as a number."""
-
-    def generate(context, builder, sig, args):
-        position = context.cast(builder, args[1], sig.args[1], types.int64)
-        return builder.extract_element(args[0], builder.trunc(position, _INT32))
-
-    return types.float32(vector, index), generate
-
-
-# A shuffle tree: each step adds neighbours, so that 8 sums cost 7 additions instead of 8 x 3.
-_TREE = (
-    ([0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15]),
-    ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]),
-    ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]),
-)
-
-
-def _add_neighbours(builder, level: int, x, y):
-    even, odd = _TREE[level]
-    return builder.fadd(
-        _shuffle(builder, x, y, even), _shuffle(builder, x, y, odd), flags=_FAST_MATH
-    )
-
-
-@intrinsic
-def lane_sums(typing_context, a, b, c, d, e, f, g, h):  # noqa: PLR0913 - one per lane
-    """The horizontal sums of 8 vectors, as one vector."""
-
-    def generate(context, builder, sig, args):
-        vectors = list(args)
-        for level in range(3):
-            pairs = zip(vectors[::2], vectors[1::2], strict=True)
-            vectors = [_add_neighbours(builder, level, x, y) for x, y in pairs]
-        return vectors[0]
-
-    return float8(a, b, c, d, e, f, g, h), generate
-
-
-@intrinsic
-def lane_sums_of_two(typing_context, a, b):
-    """The horizontal sums of 2 vectors, in lanes 0 and 1."""
-
-    def generate(context, builder, sig, args):
-        sums = _add_neighbours(builder, 0, *args)
-        sums = _add_neighbours(builder, 1, sums, sums)
-        return _add_neighbours(builder, 2, sums, sums)
-
-    return float8(a, b), generate
-
-
-def _rounded(name: str):
-    """Code that rounds a float32 by an LLVM function and gives an int64."""
-
-    def generate(context, builder, sig, args):
-        kind = ir.FunctionType(_FLOAT, [_FLOAT])
-        whole = builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
-        return builder.sext(builder.fptosi(whole, _INT32), _INT64)
-
-    return generate
-
-
-@intrinsic
-def ceil_index(typing_context, x):
-    """The least whole number not below a float32."""
-    return types.int64(x), _rounded("llvm.ceil.f32")
-
-
-@intrinsic
-def floor_index(typing_context, x):
-    """The greatest whole number not above a float32."""
-    return types.int64(x), _rounded("llvm.floor.f32")

@@ -27,16 +27,10 @@ from services.mapping.rasterizer.kernel_types import (
     SLANT,
     TILE,
 )
+from services.mapping.rasterizer.lanes import ceil_index, floor_index
 from services.mapping.rasterizer.memory import element, load, store
 from services.mapping.rasterizer.scene import ALPHA_MAX, TRANSMITTANCE_MIN
-from services.mapping.rasterizer.simd import (
-    ceil_index,
-    floor_index,
-    inlined,
-    minimum,
-    ramp,
-    select,
-)
+from services.mapping.rasterizer.simd import inlined, minimum, ramp, select
 
 STRIDE = TILE + 8
 PLANE = TILE * STRIDE

@@ -11,15 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from services.mapping.rasterizer.kernel_types import BLUE, DEPTH, E2, GREEN, RECORD, RED
+from services.mapping.rasterizer.lanes import lane_sums, lane_sums_of_two
 from services.mapping.rasterizer.memory import element, fetch_add, load, store
-from services.mapping.rasterizer.simd import (
-    inlined,
-    kernel,
-    lane_sums,
-    lane_sums_of_two,
-    select,
-    splat,
-)
+from services.mapping.rasterizer.simd import inlined, kernel, select, splat
 from services.mapping.rasterizer.tiles import (
     BATCH,
     ONE,

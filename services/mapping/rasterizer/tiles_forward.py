@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 from services.mapping.rasterizer.binning import sort_keys
 from services.mapping.rasterizer.kernel_types import BLUE, DEPTH, E2, GREEN, RECORD, RED
+from services.mapping.rasterizer.lanes import any_lane
 from services.mapping.rasterizer.memory import element, fetch_add, load, store
-from services.mapping.rasterizer.simd import (
-    any_lane,
-    inlined,
-    kernel,
-    negative_magnitude,
-    select,
-    splat,
-)
+from services.mapping.rasterizer.simd import inlined, kernel, negative_magnitude, select, splat
 from services.mapping.rasterizer.tiles import (
     BATCH,
     ONE,

@@ -1,0 +1,87 @@
+"""Tile lists: every pair that matters, in order of depth."""
+
+import numpy as np
+import pytest
+
+from services.mapping.rasterizer.binning import bin_gaussians, sort_keys
+from services.mapping.rasterizer.kernel_types import RECORD, TILE, Camera, Projected, Splats
+from services.mapping.rasterizer.projection import project
+from services.mapping.rasterizer.scene import View
+from services.mapping.rasterizer.simd import kernel
+from services.mapping.rasterizer.threads import workers
+from shared.camera import Intrinsics
+
+CAMERA = Camera.of(View(np.eye(4), Intrinsics(120.0, 120.0, 79.5, 59.5, 160, 120)))
+
+
+@kernel
+def _sort(keys, spare, histograms):
+    sort_keys(keys, spare, histograms)
+
+
+def _projected(count, seed=0):
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-1, -1, 0.5], [1, 1, 3], (count, 3))
+    splats = Splats(
+        means.astype(np.float32).reshape(-1),
+        np.exp(rng.normal(-3.5, 1.0, count * 3)).astype(np.float32),
+        rng.normal(size=count * 4).astype(np.float32),
+        rng.uniform(0.01, 1, count).astype(np.float32),
+        rng.uniform(0, 1, count * 3).astype(np.float32),
+    )
+    projected = Projected.empty(count)
+    workers(1).run(project, splats, CAMERA, projected)
+    return projected
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 47, 48, 500, 5000])
+def test_keys_come_out_sorted(count):
+    rng = np.random.default_rng(count)
+    depths = rng.uniform(0.2, 9, count).astype(np.float32)
+    depths[: count // 3] = 1.0
+    keys = (depths.view(np.uint32).astype(np.uint64) << 32) | np.arange(count, dtype=np.uint64)
+    expected = np.sort(keys)
+
+    _sort(keys, np.empty(count, np.uint64), np.empty((4, 256), np.int32))
+
+    np.testing.assert_array_equal(keys, expected)
+
+
+def test_every_pixel_within_an_ellipse_lies_in_a_listed_tile():
+    projected = _projected(300)
+    records = projected.records.reshape(-1, RECORD)
+
+    lists = bin_gaussians(projected, CAMERA, workers(2))
+
+    columns = -(-CAMERA.width // TILE)
+    listed = {
+        (int(gaussian), tile)
+        for tile in range(CAMERA.tiles())
+        for gaussian in lists.unsorted[lists.tile_starts[tile] : lists.tile_starts[tile + 1]]
+    }
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    for index in np.nonzero(projected.counts)[0]:
+        mean_x, mean_y, e1, shear, e2, *_ = records[index].astype(np.float64)
+        dx, dy = x + 0.5 - mean_x, y + 0.5 - mean_y
+        exponent = (e1 * dx) ** 2 + (e2 * (dy - shear * dx)) ** 2
+        inside = exponent < records[index, 12] * (1 - 1e-4)
+        tiles = set(((y // TILE) * columns + x // TILE)[inside].tolist())
+        assert {(int(index), tile) for tile in tiles} <= listed
+
+
+def test_slots_lead_each_gaussian_to_its_own_pairs():
+    projected = _projected(5000)
+
+    lists = bin_gaussians(projected, CAMERA, workers(2))
+
+    owners = np.repeat(np.arange(5000), np.diff(lists.starts))
+    np.testing.assert_array_equal(lists.unsorted[lists.slots], owners)
+    assert sorted(lists.slots) == list(range(len(lists.slots)))
+
+
+def test_thin_gaussians_skip_the_tiles_of_their_box_that_they_miss():
+    projected = _projected(5000)
+
+    lists = bin_gaussians(projected, CAMERA, workers(1))
+
+    assert len(lists.slots) < projected.counts.sum()
