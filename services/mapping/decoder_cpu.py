@@ -86,9 +86,9 @@ class _Decode(torch.autograd.Function):
         positions, camera, features, offsets, scalings, *matrices = (
             t.detach().numpy() for t in tensors
         )
-        rows = _Inputs(positions, features, offsets.reshape(len(offsets), -1, 3), scalings)
+        k = offsets.shape[1] // 3
+        rows = _Inputs(positions, features, offsets.reshape(-1, k, 3), scalings)
         weights: dict[str, Array] = dict(zip(WEIGHTS, matrices, strict=True))
-        k = rows.offsets.shape[1]
         out = {name: np.empty((len(positions), k, w), np.float32) for name, w in _OUTPUTS.items()}
 
         def work(start: int, stop: int) -> _Piece:
@@ -104,7 +104,7 @@ class _Decode(torch.autograd.Function):
         rows: _Inputs = ctx.rows
         count, k = rows.offsets.shape[:2]
         upstream = {
-            name: gradient.numpy().reshape(count, k, -1)
+            name: gradient.numpy().reshape(count, k, _OUTPUTS[name])
             for name, gradient in zip(_OUTPUTS, gradients, strict=True)
         }
         down = _Inputs(*(np.empty_like(a) for a in (rows.positions, *_trained(rows))))

@@ -207,6 +207,8 @@ class Mapper:
         appearance = self._appearance(exposure.requires_grad_())
         with self.stages.stage("iteration"):
             drawn = self._draw(keyframe, target)
+            if len(drawn.visible.index) == 0:  # a keyframe without depth, far from the map
+                return
             with self.stages.stage("loss"):
                 loss = mapping_loss(drawn.rendered, target, appearance, self.config.loss)
             with self.stages.stage("backward"):

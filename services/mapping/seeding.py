@@ -39,6 +39,7 @@ class _Samples:
     colours: NDArray[np.float32]  # [P, 3]
     depths: NDArray[np.float32]  # [P]
     levels: NDArray[np.int64]  # [P]
+    is_landmark: NDArray[np.bool_]  # [P], in the voxel of an ORB point
 
 
 def seed_anchors(
@@ -53,14 +54,16 @@ def seed_anchors(
         taken: keys of voxels that have an anchor already, [N].
         rng: jitters the samples inside their pixels.
     """
-    landmark_keys = _landmark_keys(request, config)
-    samples = _samples(request, landmark_keys, config, rng)
-    starts, counts = _free_voxels(samples, taken, landmark_keys, config)
+    samples = _samples(request, config, rng)
+    fx = request.image.intrinsics.fx
+    starts, counts = _supported_voxels(samples, 1.0 / fx, config)
+    is_free = ~np.isin(samples.keys[starts], taken)
+    starts, counts = starts[is_free], counts[is_free]
     picks = _pick_children(starts, counts, config.children)
     levels = samples.levels[starts]
     positions = centres(samples.points_world[starts], levels, config)
     sides = sizes_m(levels, config)
-    spacing = samples.depths[starts] / np.float32(request.image.intrinsics.fx)
+    spacing = samples.depths[starts] / np.float32(fx)
     offsets = (samples.points_world[picks] - positions[:, None]) / sides[:, None, None]
     offsets += _repeat_jitter(counts, spacing / sides, config.children, rng)
     return NewAnchors(
@@ -69,7 +72,7 @@ def seed_anchors(
         offsets=offsets.reshape(len(starts), -1).astype(np.float32),
         scalings=_scalings(sides, spacing, counts, config),
         keys=samples.keys[starts],
-        is_primary=np.isin(samples.keys[starts], landmark_keys),
+        is_primary=samples.is_landmark[starts],
     )
 
 
@@ -80,12 +83,7 @@ def _landmark_keys(request: SeedRequest, config: AnchorConfig) -> NDArray[np.int
     return voxel_keys(points[in_front], levels_at(depths[in_front], config), config)
 
 
-def _samples(
-    request: SeedRequest,
-    landmark_keys: NDArray[np.int64],
-    config: AnchorConfig,
-    rng: np.random.Generator,
-) -> _Samples:
+def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generator) -> _Samples:
     """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
     image, camera = request.image, request.image.intrinsics
     rows, columns = np.nonzero(image.depth_m > 0.0)
@@ -99,7 +97,8 @@ def _samples(
     points = transform(request.T_world_camera, rays * depths[:, None])
     levels = levels_at(depths, config)
     keys = voxel_keys(points, levels, config)
-    wanted = np.flatnonzero(request.is_uncovered[rows, columns] | np.isin(keys, landmark_keys))
+    is_landmark = np.isin(keys, _landmark_keys(request, config))
+    wanted = np.flatnonzero(request.is_uncovered[rows, columns] | is_landmark)
     wanted = wanted[np.argsort(keys[wanted], kind="stable")]
     return _Samples(
         keys=keys[wanted],
@@ -107,20 +106,22 @@ def _samples(
         colours=image.rgb[rows[wanted], columns[wanted]].astype(np.float32) / 255.0,
         depths=depths[wanted],
         levels=levels[wanted],
+        is_landmark=is_landmark[wanted],
     )
 
 
-def _free_voxels(
-    samples: _Samples,
-    taken: NDArray[np.int64],
-    landmark_keys: NDArray[np.int64],
-    config: AnchorConfig,
+def _supported_voxels(
+    samples: _Samples, pixel_rad: float, config: AnchorConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First sample and number of samples of each voxel that gets an anchor."""
-    keys, starts, counts = np.unique(samples.keys, return_index=True, return_counts=True)
-    is_supported = (counts >= config.min_samples) | np.isin(keys, landmark_keys)
-    is_free = is_supported & ~np.isin(keys, taken)
-    return starts[is_free], counts[is_free]
+    """First sample and number of samples of each voxel that has enough of them.
+
+    One is enough for an ORB point, and where a voxel is no wider than two pixels.
+    """
+    _, starts, counts = np.unique(samples.keys, return_index=True, return_counts=True)
+    is_narrow = sizes_m(samples.levels[starts], config) < 2.0 * pixel_rad * samples.depths[starts]
+    enough = np.where(is_narrow | samples.is_landmark[starts], 1, config.min_samples)
+    is_supported = counts >= enough
+    return starts[is_supported], counts[is_supported]
 
 
 def _pick_children(

@@ -1,0 +1,230 @@
+"""Sessions in this process: order, durability, resume."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from services.mapping.config import MappingConfig, OwnerConfig
+from services.mapping.session import Session, Surroundings
+from services.mapping.storage import SessionFolder, SessionRecord
+from shared import se3
+from shared.errors import ConflictError, InputError
+from shared.maps import ExportFormat, ExportRequest, RefineRequest, RenderRequest
+from shared.tracks import ContextRequest
+
+CONFIG = MappingConfig(owner=OwnerConfig(max_pending=2))
+
+
+@pytest.fixture
+def record(calibration):
+    return SessionRecord("room", "offline", 7, 0, 1, calibration, np.eye(4))
+
+
+@pytest.fixture
+def published():
+    return []
+
+
+@pytest.fixture
+def open_session(tmp_path, record, published):
+    """Opens the session at a path, creating it the first time; closes all at the end."""
+    surroundings = Surroundings(
+        "m0", CONFIG, torch.device("cpu"), lambda session, poses: published.append(poses)
+    )
+    opened = []
+
+    def make(name: str = "room") -> Session:
+        path = tmp_path / name
+        folder = SessionFolder(path)
+        if not (path / "session.msgpack").exists():
+            folder.write_record(record)
+        opened.append(Session(folder, surroundings))
+        return opened[-1]
+
+    yield make
+    for session in opened:
+        session.close(is_saved=False)
+
+
+def parameters(session: Session) -> dict[str, torch.Tensor]:
+    session._worker.drain()
+    return session._worker.visit(lambda mapper: mapper.state()).tensors
+
+
+def test_an_advance_tells_the_revision_that_its_keyframe_made(open_session, entry):
+    session = open_session()
+
+    replies = [session.advance(entry(seq)) for seq in range(6)]
+
+    assert [reply.map_revision for reply in replies] == [1, 1, 1, 1, 2, 2]
+
+
+def test_a_repeated_entry_is_acknowledged_and_changes_nothing(open_session, entry):
+    session = open_session()
+    session.advance(entry(0))
+
+    reply = session.advance(entry(0))
+
+    assert (reply.acknowledged_seq, reply.map_revision, session.ledger.entries) == (0, 1, 1)
+
+
+def test_an_entry_older_than_the_newest_is_refused(open_session, entry):
+    session = open_session()
+    session.advance(entry(4))
+
+    with pytest.raises(ConflictError, match="not newer than 4"):
+        session.advance(entry(2))
+
+
+def test_a_keyframe_without_its_data_is_refused(open_session, entry):
+    session = open_session()
+
+    with pytest.raises(InputError, match="both its frame and its data"):
+        session.advance(replace(entry(0), keyframe=None))
+
+
+def test_a_context_holds_a_keyframe_at_once(open_session, entry):
+    session = open_session()
+    session.advance(entry(0))
+
+    context = session.ledger.context(ContextRequest(1, 0))
+
+    assert (context.num_keyframes, context.revision) == (1, 1)
+    assert len(context.cloud_world.points) > 0
+
+
+def test_every_revision_is_published(open_session, entry, published):
+    session = open_session()
+
+    for seq in range(5):
+        session.advance(entry(seq))
+
+    assert [poses.revision for poses in published] == [1, 2]
+
+
+def test_two_runs_with_one_seed_give_the_same_map_to_the_bit(open_session, entry):
+    maps = []
+    for name in ("a", "b"):
+        session = open_session(name)
+        for seq in range(9):
+            session.advance(entry(seq))
+        maps.append(parameters(session))
+
+    assert maps[0].keys() == maps[1].keys()
+    assert all(torch.equal(maps[0][name], maps[1][name]) for name in maps[0])
+
+
+def test_a_session_killed_after_a_snapshot_goes_on_to_the_same_map(open_session, entry, tmp_path):
+    whole = open_session("whole")
+    for seq in range(12):
+        whole.advance(entry(seq))
+    killed = open_session("killed")
+    for seq in range(5):
+        killed.advance(entry(seq))
+    killed.save()
+    for seq in range(5, 9):
+        killed.advance(entry(seq))
+    # What a kill leaves is what is on the disk now; the process's lock dies with it.
+    shutil.copytree(tmp_path / "killed", tmp_path / "resumed")
+
+    resumed = open_session("resumed")
+    for seq in range(9, 12):
+        resumed.advance(entry(seq))
+
+    assert resumed.ledger.revision == whole.ledger.revision
+    expected, found = parameters(whole), parameters(resumed)
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+
+
+def test_a_session_resumes_from_the_log_alone(open_session, entry, tmp_path):
+    session = open_session()
+    for seq in range(6):
+        session.advance(entry(seq))
+    shutil.copytree(tmp_path / "room", tmp_path / "copy")
+
+    resumed = open_session("copy")
+
+    assert resumed.opening().last is not None
+    assert resumed.opening().last.seq == 5
+    assert resumed.opening().keyframe_poses.seqs.tolist() == [0, 4]
+    assert resumed.record.epoch == session.record.epoch + 1
+
+
+def test_final_poses_follow_their_keyframe(open_session, entry, true_pose):
+    session = open_session()
+    session.advance(entry(0))
+    session.advance(entry(1))
+    moved = se3.exp([0.1, 0, 0, 0, 0, 0]) @ true_pose(0)
+    correction = entry(4)
+    old = correction.keyframe.correction
+    poses = np.stack([moved, true_pose(4)])
+    new = replace(old, keyframe_seqs=np.array([0, 4]), T_world_keyframes=poses)
+    session.advance(replace(correction, keyframe=replace(correction.keyframe, correction=new)))
+
+    final = session.ledger.trajectory().T_world_cameras_final
+
+    np.testing.assert_allclose(final[1][:3, 3] - true_pose(1)[:3, 3], [0.1, 0, 0], atol=1e-9)
+
+
+def test_a_refinement_runs_to_its_end_and_says_so(open_session, entry):
+    session = open_session()
+    session.advance(entry(0))
+
+    session.refine(RefineRequest(3))
+    while session.info().refinement.is_running:
+        os.sched_yield()
+
+    assert session.info().refinement.iterations_done == 3
+
+
+def test_a_second_refinement_is_refused_while_one_runs(open_session, entry):
+    session = open_session()
+    session.advance(entry(0))
+    session.refine(RefineRequest(10_000))
+
+    with pytest.raises(ConflictError, match="interrupt"):
+        session.refine(RefineRequest(1))
+
+    assert not session.interrupt().is_running
+
+
+def test_a_session_can_be_rendered_before_its_first_keyframe(open_session):
+    session = open_session()
+
+    reply = session.render(RenderRequest(np.eye(4), session.record.calibration.colour.intrinsics))
+
+    assert reply.rgb.max() == reply.alpha.max() == reply.depth_m.max() == 0
+
+
+def test_a_render_with_a_pose_that_is_no_number_is_refused(open_session):
+    session = open_session()
+    intrinsics = session.record.calibration.colour.intrinsics
+
+    with pytest.raises(InputError, match="T_world_camera"):
+        session.render(RenderRequest(np.full((4, 4), np.nan), intrinsics))
+
+
+def test_a_second_owner_is_refused(open_session, tmp_path):
+    open_session()
+
+    with pytest.raises(ConflictError, match="open in another process"):
+        SessionFolder(tmp_path / "room")
+
+
+def test_the_exported_folder_is_a_session_again(open_session, entry, tmp_path):
+    session = open_session()
+    session.advance(entry(0))
+    (tmp_path / "room.tar").write_bytes(
+        b"".join(chunk.bytes for chunk in session.export(ExportRequest(ExportFormat.SNAPSHOT)))
+    )
+    shutil.unpack_archive(tmp_path / "room.tar", tmp_path / "elsewhere", filter="data")
+
+    resumed = open_session("elsewhere/room")
+
+    assert resumed.ledger.num_keyframes == 1
