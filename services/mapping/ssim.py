@@ -116,6 +116,6 @@ class _Ssim(torch.autograd.Function):
         layout = ctx.target.layout
         scale = np.float32(gradients[0].item() / (3 * layout.height * layout.width))
         result = np.empty((layout.height, layout.width, 3), np.float32)
-        images = ctx.pixels, ctx.target.target.pixels
-        _run(ctx.threads, spread_back, images, ctx.slopes, layout, scale, result.reshape(-1))
+        sources = (ctx.pixels, ctx.target.target.pixels), ctx.slopes
+        _run(ctx.threads, spread_back, sources, layout, scale, result.reshape(-1))
         return torch.from_numpy(result), None, None

@@ -179,8 +179,9 @@ def _compare_strip(rows, target, slopes, place, inside):
 
 
 @kernel
-def spread_back(images, slopes, layout, scale, result, counter):  # noqa: PLR0913
+def spread_back(sources, layout, scale, result, counter):
     """Gradient at the image [H, W, 3], a row per count: the blur is its own transpose."""
+    images, slopes = sources
     height, width, stride = layout
     rows, line = _rows(stride), np.empty(stride, np.float32)
     while True:

@@ -19,9 +19,10 @@ from services.mapping.rasterizer.kernel_types import (
     Projected,
     Splats,
     TileLists,
+    Tiles,
 )
 from services.mapping.rasterizer.projection import project
-from services.mapping.rasterizer.projection_backward import Gradients, project_backward
+from services.mapping.rasterizer.projection_backward import Gradients, Pairs, project_backward
 from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
 from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.threads import Workers, default_threads, workers
@@ -47,8 +48,8 @@ class CpuRasterizer:
         gaussians.check()
         frame = self._engine.prepare(gaussians, view)
         screen = ScreenStatistics(torch.from_numpy(np.diff(frame.lists.starts) > 0))
-        pass_ = _Pass(self._engine, frame, screen)
-        images = _Rasterize.apply(*gaussians.tensors(), view.pose(), pass_)
+        run = _Run(self._engine, frame, screen)
+        images = _Rasterize.apply(*gaussians.tensors(), view.pose(), run)
         return Rendered(*images, screen=screen)
 
 
@@ -60,6 +61,9 @@ class _Frame:
     camera: Camera
     projected: Projected
     lists: TileLists
+
+    def tiles(self) -> Tiles:
+        return Tiles(self.projected.records, self.lists, self.camera)
 
 
 @dataclass(frozen=True)
@@ -81,24 +85,21 @@ class _Engine:
     def blend(self, frame: _Frame) -> tuple[Tensor, Tensor, Tensor]:
         size = frame.camera.height, frame.camera.width
         images = torch.empty(*size, 3), torch.empty(size), torch.empty(size)
-        records = frame.projected.records
-        self.pool.run(blend_tiles, records, frame.lists, frame.camera, _images(images))
+        self.pool.run(blend_tiles, frame.tiles(), _images(images))
         return images
 
     def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
         lists, records = frame.lists, frame.projected.records
         result = _empty_gradients(len(frame.splats.opacities))
         with self.scratch.borrow(len(lists.slots) * RECORD) as sums:
-            self.pool.run(
-                blend_tiles_backward, records, lists, frame.camera, images, gradients, sums
-            )
-            pairs = lists.starts, lists.slots, lists.ranks, sums
-            self.pool.run(project_backward, frame.splats, frame.camera, records, pairs, result)
+            self.pool.run(blend_tiles_backward, frame.tiles(), images, gradients, sums)
+            pairs = Pairs(records, lists.starts, lists.slots, lists.ranks, sums)
+            self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
         return result
 
 
 @dataclass(frozen=True)
-class _Pass:
+class _Run:
     """One forward pass, and where its backward pass leaves the statistics."""
 
     engine: _Engine

@@ -106,3 +106,11 @@ class TileLists(NamedTuple):
     keys: NDArray[np.uint64]  # depth bits and place within the tile, [M]
     gaussians: NDArray[np.int32]  # Gaussian of each place, ordered by tile and depth, [M]
     ranks: NDArray[np.int32]  # [M]
+
+
+class Tiles(NamedTuple):
+    """What the blending of tiles reads: records, lists and the size of the image."""
+
+    records: NDArray[np.float32]
+    lists: TileLists
+    camera: Camera

@@ -53,6 +53,16 @@ _SUM_ROWS = _PILE + RECORD
 _MEAN, _SCALE, _QUAT, _OPACITY, _SCREEN, _OUT_ROWS = 0, 3, 6, 10, 11, 13
 
 
+class Pairs(NamedTuple):
+    """Records of Gaussians and of pairs, and the way from one to the other (see `TileLists`)."""
+
+    records: NDArray[np.float32]
+    starts: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    ranks: NDArray[np.int32]
+    sums: NDArray[np.float32]  # gradient records, ordered by tile and depth
+
+
 class Gradients(NamedTuple):
     """Gradients of the loss, flat; each Gaussian's are written exactly once."""
 
@@ -66,11 +76,8 @@ class Gradients(NamedTuple):
 
 
 @kernel
-def project_backward(splats, camera, records, pairs, gradients, counter):  # noqa: PLR0913
-    """Fill `gradients`, a chunk of Gaussians per count.
-
-    `pairs` are the arrays of pairs: `TileLists` starts, slots and ranks, and the summed records.
-    """
+def project_backward(splats, camera, pairs, gradients, counter):
+    """Fill `gradients`, a chunk of Gaussians per count."""
     lanes, sums = np.empty(BLOCK_ROWS * 8, np.float32), np.empty(_SUM_ROWS * 8, np.float32)
     out, total = np.empty(_OUT_ROWS * 8, np.float32), len(splats.opacities)
     while True:
@@ -85,7 +92,7 @@ def project_backward(splats, camera, records, pairs, gradients, counter):  # noq
             _prefetch_pairs(pairs, base + 16, min(stop, base + 24))
             seen = _sum_pairs(pairs, base, count, sums)
             if seen >= 0:
-                _gather_block(splats, records, (base, count, pairs[0], seen), lanes, sums)
+                _gather_block(splats, pairs, (base, count, seen), lanes, sums)
                 _block_gradients(lanes, camera, sums, out, pose)
                 _write_block(gradients, camera, (base, count), sums, out)
             else:
@@ -95,10 +102,10 @@ def project_backward(splats, camera, records, pairs, gradients, counter):  # noq
 @inlined
 def _prefetch_pairs(pairs, first, stop):
     """The records of a Gaussian lie where its tiles put them: ask for them early."""
-    starts, slots, ranks, sums = pairs
     for i in range(first, stop):
-        if starts[i + 1] > starts[i]:
-            prefetch(sums, np.int64(ranks[slots[starts[i]]]) * RECORD)
+        slot = pairs.starts[i]
+        if pairs.starts[i + 1] > slot:
+            prefetch(pairs.sums, np.int64(pairs.ranks[pairs.slots[slot]]) * RECORD)
 
 
 @inlined
@@ -107,13 +114,13 @@ def _sum_pairs(pairs, base, count, sums):
 
     Gives a Gaussian of the block that has any tile, or -1.
     """
-    starts, slots, ranks, records = pairs
+    starts, slots, ranks = pairs.starts, pairs.slots, pairs.ranks
     seen = -1
     for l in range(count):
         low, high = splat(_ZERO), splat(_ZERO)
         for slot in range(starts[base + l], starts[base + l + 1]):
             place = np.int64(ranks[slots[slot]]) * RECORD
-            low, high = low + load(records, place), high + load(records, place + 8)
+            low, high = low + load(pairs.sums, place), high + load(pairs.sums, place + 8)
             seen = base + l
         store(sums, _PILE * 8 + l * RECORD, low)
         store(sums, _PILE * 8 + l * RECORD + 8, high)
@@ -124,13 +131,14 @@ def _sum_pairs(pairs, base, count, sums):
 
 
 @inlined
-def _gather_block(splats, records, index, lanes, sums):
+def _gather_block(splats, pairs, block, lanes, sums):
     """Transpose 8 Gaussians and what their records hold of the projection.
 
     A stand-in takes the lane of a Gaussian without tiles: its sums are 0 but its projection may
     be infinite, and 0 times infinity would be NaN.
     """
-    base, count, starts, stand_in = index
+    base, count, stand_in = block
+    starts, records = pairs.starts, pairs.records
     for l in range(8):
         has_tiles = l < count and starts[base + l + 1] > starts[base + l]
         i = base + l if has_tiles else stand_in

@@ -105,7 +105,9 @@ class View:
         Raises:
             InputError: it is not 4x4 or not finite.
         """
-        T = torch.as_tensor(self.T_camera_world)
+        T = self.T_camera_world
+        if not isinstance(T, Tensor):
+            T = torch.from_numpy(np.array(T, np.float64))
         if tuple(T.shape) != (4, 4) or not bool(torch.isfinite(T).all()):
             raise InputError(
                 "T_camera_world", f"must be 4x4 finite numbers, got shape {list(T.shape)}"

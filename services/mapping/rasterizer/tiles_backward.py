@@ -34,11 +34,12 @@ _REST, _GRADIENT = PLANE, 2 * PLANE
 
 
 @kernel
-def blend_tiles_backward(records, lists, camera, images, gradients, sums, counter):  # noqa: PLR0913
+def blend_tiles_backward(tiles, images, gradients, sums, counter):
     """Fill `sums`, RECORD numbers per pair, one tile per count.
 
     `images` and `gradients` are the `Images` of the forward pass and the gradients at them.
     """
+    records, lists, camera = tiles
     planes, batch = np.empty(7 * PLANE, np.float32), np.empty(BATCH * RECORD, np.float32)
     while True:
         index = fetch_add(counter, 0, 1)

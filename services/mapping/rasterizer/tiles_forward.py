@@ -40,8 +40,9 @@ class Images(NamedTuple):
 
 
 @kernel
-def blend_tiles(records, lists, camera, images, counter):
+def blend_tiles(tiles, images, counter):
     """Sort and blend one tile per count, front to back."""
+    records, lists, camera = tiles
     planes, batch = np.empty(5 * PLANE, np.float32), np.empty(BATCH * RECORD, np.float32)
     spare = np.empty(_longest(lists.tile_starts), np.uint64)
     histograms = np.empty((4, 256), np.int32)
