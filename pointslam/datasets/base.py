@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -89,6 +88,14 @@ class Sequence(Protocol):
         """Read one frame; raises SequenceError naming the file that cannot be read."""
         ...
 
+    def stamp(self, index: int) -> str:
+        """A frame's stamp as the sequence's own files spell it."""
+        ...
+
+    def t_ns(self, index: int) -> int:
+        """A frame's stamp in nanoseconds."""
+        ...
+
     def truth(self, index: int) -> Matrix | None:
         """`T_world_camera` of a frame without reading its images."""
         ...
@@ -140,12 +147,20 @@ class FileSequence:
         """How many views off the trajectory there are."""
         return len(self.views)
 
-    @cached_property
+    @property
     def rate_hz(self) -> float:
         """Frames a second, by the median step between stamps."""
         if len(self) < 2:
             return _DEFAULT_RATE_HZ
         return 1e9 / float(np.median(np.diff([f.t_ns for f in self.frames])))
+
+    def stamp(self, index: int) -> str:
+        """A frame's stamp as the sequence's own files spell it."""
+        return self.frames[index].stamp
+
+    def t_ns(self, index: int) -> int:
+        """A frame's stamp in nanoseconds."""
+        return self.frames[index].t_ns
 
     def truth(self, index: int) -> Matrix | None:
         """`T_world_camera` of a frame, where the sequence knows it."""

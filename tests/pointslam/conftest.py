@@ -9,6 +9,31 @@ import cv2
 import numpy as np
 import pytest
 
+from pointslam.datasets import FileSequence, open_sequence
+from pointslam.synth import Noise, SynthOptions, write_sequence
+from shared.camera import Intrinsics
+
+ROOM = SynthOptions(
+    num_frames=34,
+    num_views=2,
+    noise=Noise.NONE,
+    camera=Intrinsics(131.25, 131.25, 79.5, 59.5, 160, 120),
+)
+
+
+@pytest.fixture(scope="session")
+def room_options() -> SynthOptions:
+    """How `room` was made."""
+    return ROOM
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory) -> FileSequence:
+    """A small procedural sequence without noise."""
+    folder = tmp_path_factory.mktemp("synth") / "room"
+    write_sequence(folder, ROOM)
+    return open_sequence(folder)
+
 
 @pytest.fixture
 def write_images():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pointslam.datasets import open_sequence
-from pointslam.synth import Noise, SynthOptions, write_sequence
+from pointslam.synth import SynthOptions, write_sequence
 from pointslam.synth.kinect import KinectNoise, measure_depth
 from pointslam.synth.path import camera_path, look
 from pointslam.synth.render import render_depth
@@ -23,20 +23,13 @@ from shared.rectify import rectify
 SMALL = Intrinsics(131.25, 131.25, 79.5, 59.5, 160, 120)
 
 
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("synth") / "room"
-    write_sequence(folder, SynthOptions(num_frames=12, num_views=2, noise=Noise.NONE, camera=SMALL))
-    return open_sequence(folder)
-
-
 def rectified(sequence, index):
     frame = sequence.frame(index)
     return rectify(Frame(0, 0, frame.rgb, frame.depth), sequence.calibration)
 
 
 def test_a_recording_is_a_readable_sequence_with_views(room):
-    assert len(room) == 12
+    assert len(room) == 34
     assert room.num_views == 2
     assert room.rate_hz == pytest.approx(30.0, rel=1e-4)
 
@@ -64,9 +57,9 @@ def test_colour_has_the_detail_that_features_need(room):
     assert len(cv2.ORB.create(500, nlevels=2).detect(grey, None)) > 100
 
 
-def test_a_seed_gives_the_same_bytes(room, tmp_path):
+def test_a_seed_gives_the_same_bytes(room, room_options, tmp_path):
     again = tmp_path / "again"
-    write_sequence(again, SynthOptions(num_frames=12, num_views=2, noise=Noise.NONE, camera=SMALL))
+    write_sequence(again, room_options)
 
     assert open_sequence(again).frame(7).rgb.bytes == room.frame(7).rgb.bytes
     assert open_sequence(again).frame(7).depth.bytes == room.frame(7).depth.bytes

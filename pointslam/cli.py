@@ -1,0 +1,179 @@
+"""The command line: `pointslam run | evaluate | up | synth | export | bench`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pointslam.settings import read_settings
+from shared.errors import PointSlamError
+
+# Commands import what they need themselves: `up` wants no plotting, `synth` no network.
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; an error of ours is one line and exit code 2."""
+    arguments = _parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], None] = arguments.command
+    try:
+        command(arguments)
+    except PointSlamError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="pointslam", description="RGB-D SLAM as services")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_run(commands.add_parser("run", help="stream a sequence and score the result"))
+    _add_evaluate(commands.add_parser("evaluate", help="score a finished run again"))
+    _add_up(commands.add_parser("up", help="start the services and keep them running"))
+    _add_synth(commands.add_parser("synth", help="render a procedural room with exact truth"))
+    _add_export(commands.add_parser("export", help="a run's or a session's map as a file"))
+    _add_bench(commands.add_parser("bench", help="measure one part"))
+    return parser
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML file with settings")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="one setting; its key starts with tracking, mapping, gateway or sequence",
+    )
+    parser.add_argument("--trackers", type=int, default=2, metavar="N")
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--mode", choices=["offline", "live"], default="offline")
+    parser.add_argument("--max-frames", type=int, metavar="N")
+    parser.add_argument("--refine", type=int, default=0, metavar="ITERATIONS")
+    parser.add_argument("--holdout", type=int, default=8, metavar="K", help="0 holds none out")
+    parser.add_argument("--gateway", metavar="URL", help="a running gateway instead of our own")
+    parser.add_argument("--seed", type=int, default=0)
+    _add_settings(parser)
+    parser.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from pointslam.evaluation.report import text_table
+    from pointslam.run import RunOptions, run_sequence
+
+    options = RunOptions(
+        sequence=arguments.sequence,
+        out=arguments.out,
+        mode=arguments.mode,
+        max_frames=arguments.max_frames,
+        refine=arguments.refine,
+        holdout=arguments.holdout,
+        device=arguments.device,
+        gateway=arguments.gateway,
+        seed=arguments.seed,
+        num_trackers=arguments.trackers,
+        settings=read_settings(arguments.config, arguments.set),
+    )
+    _say(text_table(run_sequence(options)))
+
+
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="DIR")
+    parser.set_defaults(command=_evaluate)
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from pointslam.evaluation.report import text_table
+    from pointslam.run import evaluate_run
+
+    _say(text_table(evaluate_run(arguments.run)))
+
+
+def _add_up(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, default=Path("pointslam-data"), metavar="DIR")
+    parser.add_argument("--http-port", type=int, default=8080, metavar="P")
+    parser.add_argument("--grpc-port", type=int, default=50051, metavar="P")
+    _add_settings(parser)
+    parser.set_defaults(command=_up)
+
+
+def _up(arguments: argparse.Namespace) -> None:
+    from pointslam.launcher import LaunchOptions
+    from pointslam.up import keep_up
+
+    options = LaunchOptions(
+        data=arguments.data,
+        logs=arguments.data / "logs",
+        num_trackers=arguments.trackers,
+        device=arguments.device,
+        http_port=arguments.http_port,
+        grpc_port=arguments.grpc_port,
+        settings=read_settings(arguments.config, arguments.set).services,
+    )
+    keep_up(options, _say)
+
+
+def _add_synth(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("--frames", type=int, default=120, metavar="N")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--noise", choices=["kinect", "none"], default="kinect")
+    parser.set_defaults(command=_synth)
+
+
+def _synth(arguments: argparse.Namespace) -> None:
+    from pointslam.progress import progress_bar
+    from pointslam.synth import Noise, SynthOptions, write_sequence
+
+    noise = Noise(arguments.noise)
+    options = SynthOptions(num_frames=arguments.frames, seed=arguments.seed, noise=noise)
+    total = options.num_frames + options.num_views
+    with progress_bar("rendering", "image") as progress:
+        write_sequence(arguments.folder, options, lambda done: progress(done, total))
+
+
+def _add_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="DIR|SESSION", help="a run's folder, or a session")
+    parser.add_argument("--format", choices=["ply", "mesh", "tum"], default="ply")
+    parser.add_argument("--gateway", metavar="URL", default="http://127.0.0.1:8080")
+    parser.add_argument("--out", type=Path, metavar="FILE")
+    parser.set_defaults(command=_export)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from pointslam.export import export_source
+
+    target = export_source(arguments.source, arguments.format, arguments.gateway, arguments.out)
+    _say(str(target))
+
+
+def _add_bench(parser: argparse.ArgumentParser) -> None:
+    from pointslam.bench import NAMES
+
+    parser.add_argument("name", choices=NAMES)
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.set_defaults(command=_bench)
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from pointslam.bench import run_benchmark
+
+    run_benchmark(arguments.name, as_json=arguments.json)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

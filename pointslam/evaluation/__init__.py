@@ -1,0 +1,1 @@
+"""Scores of a run: trajectory errors, image scores, the blocks of metrics.json, a report."""

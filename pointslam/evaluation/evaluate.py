@@ -1,0 +1,95 @@
+"""Scores a session against its sequence, and writes what a run's folder shows of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pointslam.client import Session
+from pointslam.datasets.base import Sequence, is_held_out
+from pointslam.evaluation import plots
+from pointslam.evaluation.metrics import (
+    TrajectoryScores,
+    image_entries,
+    score_trajectories,
+    trajectory_entries,
+)
+from pointslam.evaluation.protocol import EvaluationOutput, Scores, score_run
+from pointslam.evaluation.report import write_report
+from pointslam.evaluation.trajectory import Poses
+from pointslam.run_folder import RunFolder, RunRecord, tum_lines
+from shared.frames import HAS_POSE
+from shared.se3 import Matrix
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Poses by frame index, in the map, and all scores."""
+
+    online: dict[int, Matrix]
+    final: dict[int, Matrix]
+    trajectories: TrajectoryScores
+    images: Scores
+
+    def entries(self, holdout: int) -> dict[str, Any]:
+        """What metrics.json holds of it."""
+        return trajectory_entries(self.trajectories) | image_entries(self.images, holdout)
+
+
+def evaluate_session(
+    session: Session,
+    sequence: Sequence,
+    holdout: int,
+    folder: RunFolder,
+    progress: Callable[[int, int], None],
+) -> Evaluation:
+    """Fetch poses and views of a session and score them; pictures go to the run's folder."""
+    records = [r for r in session.trajectory() if r.status in HAS_POSE]
+    online = {r.seq: r.T_map_camera_online for r in records}
+    final = {r.seq: r.T_map_camera_final for r in records}
+    trajectories = score_trajectories(sequence, online, final)
+    T_truth_map = trajectories.final.T_truth_map if trajectories.final else None
+    folder.renders.mkdir(parents=True, exist_ok=True)
+    output = EvaluationOutput(folder.renders, holdout, progress)
+    images = score_run(session, sequence, final, T_truth_map, output)
+    return Evaluation(online, final, trajectories, images)
+
+
+def write_evaluation(
+    folder: RunFolder,
+    sequence: Sequence,
+    record: RunRecord,
+    evaluation: Evaluation,
+    metrics: dict[str, Any],
+) -> None:
+    """Write trajectories, metrics.json and report.html."""
+    for kind, poses in (("online", evaluation.online), ("final", evaluation.final)):
+        indices = sorted(poses)
+        stamps = [sequence.stamp(i) for i in indices]
+        folder.trajectory(kind).write_text(tum_lines(stamps, [poses[i] for i in indices]))
+    folder.write_metrics(metrics)
+    pictures = sorted(folder.renders.glob("*.png"))
+    write_report(folder.report, metrics, _plots(sequence, record, evaluation), pictures)
+
+
+def _plots(sequence: Sequence, record: RunRecord, evaluation: Evaluation) -> list[bytes]:
+    pages = []
+    trajectories, final = evaluation.trajectories, evaluation.final
+    if final:
+        T = trajectories.final.T_truth_map if trajectories.final else np.eye(4)
+        pages.append(plots.trajectory_plot(final, _truth(sequence, final), T))
+    if trajectories.final is not None:
+        pages.append(plots.error_plot(trajectories))
+    if evaluation.images.frames:
+        pages.append(plots.psnr_plot(evaluation.images, lambda i: is_held_out(i, record.holdout)))
+    if record.frame_ms:
+        pages.append(plots.time_plot(record.frame_seqs, record.frame_ms))
+    return pages
+
+
+def _truth(sequence: Sequence, poses: Poses) -> dict[int, Matrix]:
+    known = {i: sequence.truth(i) for i in poses}
+    return {i: T for i, T in known.items() if T is not None}

@@ -1,0 +1,129 @@
+"""The services as processes on one machine: start, health, memory, stop."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pointslam.process import Command, ServiceProcess
+from pointslam.settings import ServiceSettings
+
+START_TIMEOUT_S = 300.0  # the first start compiles every kernel
+_STOP_TIMEOUT_S = 20.0
+_HOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class LaunchOptions:
+    """What to start. Ports of 0 are chosen; `data` holds the sessions' maps."""
+
+    data: Path
+    logs: Path
+    num_trackers: int = 2
+    device: str = "auto"
+    http_port: int = 0
+    grpc_port: int = 0
+    settings: ServiceSettings = field(default_factory=ServiceSettings)
+
+
+class Services:
+    """A router, a gateway, trackers and a mapper; a context manager that stops them.
+
+    Raises:
+        UnavailableError: one of them did not start; holds the end of its log.
+    """
+
+    def __init__(self, options: LaunchOptions) -> None:
+        ports = _free_ports(3)
+        self.http_port = options.http_port or ports[0]
+        self.grpc_port = options.grpc_port or ports[1]
+        self.url = f"http://{_HOST}:{self.http_port}"
+        router = f"tcp/{_HOST}:{ports[2]}"
+        self._processes: list[ServiceProcess] = []
+        options.data.mkdir(parents=True, exist_ok=True)
+        try:
+            listen = Command("router", "router", "pointslam.router", ("--listen", router))
+            deadline = time.monotonic() + START_TIMEOUT_S
+            self._start(listen, options.logs).wait_ready(deadline)
+            for command in self._commands(options, router):
+                self._start(command, options.logs)
+            for process in self._processes:
+                process.wait_ready(deadline)
+        except BaseException:
+            self.stop()
+            raise
+
+    def __enter__(self) -> Services:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def processes(self) -> list[ServiceProcess]:
+        """All processes, in the order of their start."""
+        return list(self._processes)
+
+    def check(self) -> None:
+        """Raise UnavailableError, with the end of the log, if a process has ended."""
+        for process in self._processes:
+            process.check()
+
+    def restart_ended(self) -> list[str]:
+        """Start ended processes again; returns their names."""
+        ended = [process for process in self._processes if not process.is_running()]
+        for process in ended:
+            process.restart()
+        return [process.command.name for process in ended]
+
+    def peak_rss_mb(self) -> dict[str, float]:
+        """The most memory that each role ever held (summed over its processes), MB."""
+        total: defaultdict[str, float] = defaultdict(float)
+        for process in self._processes:
+            total[process.command.role] += process.peak_rss_bytes() / 1e6
+        return dict(total)
+
+    def stop(self) -> None:
+        """End all processes, the router last."""
+        for process in reversed(self._processes[1:]):
+            process.terminate()
+        deadline = time.monotonic() + _STOP_TIMEOUT_S
+        for process in self._processes[1:]:
+            process.wait(max(deadline - time.monotonic(), 0.1))
+        for process in self._processes[:1]:
+            process.terminate()
+            process.wait(5.0)
+        self._processes.clear()
+
+    def _start(self, command: Command, logs: Path) -> ServiceProcess:
+        self._processes.append(ServiceProcess(command, logs))
+        return self._processes[-1]
+
+    def _commands(self, options: LaunchOptions, router: str) -> list[Command]:
+        def command(role: str, name: str, *arguments: str) -> Command:
+            settings = options.settings.arguments(role)
+            common = ("--connect", router, "--id", name)
+            return Command(name, role, f"services.{role}", (*common, *arguments, *settings))
+
+        trackers = [f"tracker-{i}" for i in range(options.num_trackers)]
+        http = ("--http-host", _HOST, "--http-port", str(self.http_port))
+        data = ("--data", str(options.data), "--device", options.device)
+        return [
+            *(command("tracking", name) for name in trackers),
+            command("mapping", "mapper-0", *data),
+            command("gateway", "gateway-0", *http, "--grpc-port", str(self.grpc_port)),
+        ]
+
+
+def _free_ports(count: int) -> list[int]:
+    """Ports that nobody listens on now."""
+    sockets = [socket.socket() for _ in range(count)]
+    for opened in sockets:
+        opened.bind((_HOST, 0))
+    ports = [opened.getsockname()[1] for opened in sockets]
+    for opened in sockets:
+        opened.close()
+    return ports

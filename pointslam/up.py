@@ -1,0 +1,26 @@
+"""The services on this machine until Ctrl-C; what ends is started again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pointslam.launcher import LaunchOptions, Services
+from shared.service import stop_event
+
+_LOOK_EVERY_S = 1.0
+
+
+def keep_up(options: LaunchOptions, say: Callable[[str], None]) -> None:
+    """Run until SIGINT or SIGTERM.
+
+    Raises:
+        UnavailableError: a service did not start.
+    """
+    stop = stop_event()
+    with Services(options) as services:
+        say(f"http {services.url}  (API: {services.url}/docs)")
+        say(f"grpc 127.0.0.1:{services.grpc_port}")
+        say(f"maps {options.data}, logs {options.logs}; Ctrl-C ends")
+        while not stop.wait(_LOOK_EVERY_S):
+            for name in services.restart_ended():
+                say(f"{name} had ended and was started again")
