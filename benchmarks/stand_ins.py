@@ -61,6 +61,7 @@ class StandInTracker:
         self.status = TrackingStatus.TRACKED
         self.decodes = False
         self.requests: list[TrackRequest] = []
+        self.leave = bus.close
         bus.serve(Keys.track(name), TrackRequest, self.answer)
         bus.declare_alive("tracking", name)
 
@@ -141,6 +142,7 @@ class StandInMapper:
         self.disk: dict[str, _Map] = {} if disk is None else disk
         self._bus = bus
         self._lock = threading.Lock()
+        self.leave = bus.close
         bus.serve(Keys.mapper(name, "open"), OpenRequest, self.open)
         bus.serve(Keys.mapper(name, "list"), Empty, self.list)
         bus.serve(Keys.mapper(name, "delete"), DeleteRequest, self.delete)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterable, AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any, TypeVar
 
 import httpx
@@ -202,13 +202,15 @@ async def _send_all(
 
 @asynccontextmanager
 async def _open(url: str) -> AsyncIterator[ClientConnection]:
-    try:
-        connection = await connect(url, compression=None, ping_timeout=120)
-    except InvalidStatus as error:
-        raise calls.error_from(refusal(error)) from None
-    except (OSError, TimeoutError) as error:
-        raise UnavailableError(f"{url} does not answer ({error})") from None
-    async with connection:
+    async with AsyncExitStack() as stack:
+        try:
+            connection = await stack.enter_async_context(
+                connect(url, compression=None, ping_timeout=120)
+            )
+        except InvalidStatus as error:
+            raise calls.error_from(refusal(error)) from None
+        except (OSError, TimeoutError) as error:
+            raise UnavailableError(f"{url} does not answer ({error})") from None
         yield connection
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import httpx
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -40,19 +41,24 @@ def stream_frames(
             raise sender.failure
 
 
-def open_stream(url: str) -> ClientConnection:
+@contextmanager
+def open_stream(url: str) -> Iterator[ClientConnection]:
     """A connection for frames: no compression, which costs far more than it saves on images.
 
     Raises:
         PointSlamError: the gateway refused it.
         UnavailableError: it does not answer.
     """
-    try:
-        return connect(url, compression=None, max_size=_MAX_REPLY_BYTES, ping_timeout=120)
-    except InvalidStatus as error:
-        raise error_from(refusal(error)) from None
-    except (OSError, TimeoutError) as error:
-        raise UnavailableError(f"{url} does not answer ({error})") from None
+    with ExitStack() as stack:
+        try:
+            connection = stack.enter_context(
+                connect(url, compression=None, max_size=_MAX_REPLY_BYTES, ping_timeout=120)
+            )
+        except InvalidStatus as error:
+            raise error_from(refusal(error)) from None
+        except (OSError, TimeoutError) as error:
+            raise UnavailableError(f"{url} does not answer ({error})") from None
+        yield connection
 
 
 def refusal(error: InvalidStatus) -> ErrorDetail:

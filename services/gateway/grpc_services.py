@@ -204,6 +204,7 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
             session = await self._sessions.get(request.session_id)
             poses = session.watch()
             try:
+                await context.send_initial_metadata(())  # from here on no pose is missed
                 while True:
                     pose = timed_pose_to(await poses.get())
                     yield pose_service_pb2.WatchPosesResponse(pose=pose)

@@ -1,0 +1,174 @@
+"""Workers and mappers that go away, freeze and come back, on the real bus."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.local_gateway import free_port, gateway_process, local_gateway
+from benchmarks.stand_ins import StandInMapper, StandInTracker
+from pointslam.client import Client
+from shared.bus import open_bus
+from shared.errors import UnavailableError
+from shared.frames import TrackingStatus
+
+SECOND = 1_000_000_000
+SETTINGS = (
+    "dispatch.live_timeout_s=0.5",
+    "dispatch.first_frame_timeout_s=0.5",
+    "dispatch.offline_timeout_s=0.5",
+    "dispatch.live_wait_s=0.5",
+    "mapping.reopen_wait_s=5.0",
+)
+
+
+@pytest.fixture
+def gateway():
+    with local_gateway(2, *SETTINGS) as running:
+        yield running
+
+
+@pytest.fixture
+def client(gateway):
+    with Client(gateway.url) as client:
+        while not client.ready():
+            time.sleep(0.02)
+        yield client
+
+
+@pytest.fixture
+def session(client, calibration):
+    return client.create_session(calibration, mode="offline")
+
+
+def used(gateway, session):
+    """The tracker that answers this session, then the other."""
+    asked = [any(r.session == session.name for r in t.requests) for t in gateway.trackers]
+    return gateway.trackers if asked[0] else gateway.trackers[::-1]
+
+
+def test_a_session_stays_with_its_tracker(gateway, session, rgb, depth):
+    for i in range(10):
+        session.track(rgb, depth, (i + 1) * SECOND)
+
+    asked, other = used(gateway, session)
+    assert (len(asked.requests), len(other.requests)) == (10, 0)
+
+
+def test_a_frozen_tracker_is_left_alone_and_its_frame_goes_to_another(gateway, session, rgb, depth):
+    session.track(rgb, depth, SECOND)
+    frozen, other = used(gateway, session)
+    frozen.delay_s = 1.5
+
+    start = time.monotonic()
+    replies = [session.track(rgb, depth, (i + 2) * SECOND) for i in range(5)]
+
+    assert time.monotonic() - start < 1.2  # one time-out, not five
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+    assert [request.frame.seq for request in other.requests] == [1, 2, 3, 4, 5]
+
+
+def test_the_trajectory_does_not_depend_on_the_tracker(gateway, session, rgb, depth):
+    session.track(rgb, depth, SECOND)
+    used(gateway, session)[0].delay_s = 1.5
+
+    session.track(rgb, depth, 2 * SECOND)
+
+    np.testing.assert_allclose([T[0, 3] for _, T in session.poses()], [0.0, 0.01], atol=1e-12)
+
+
+def test_a_tracker_that_goes_away_is_replaced_at_once(gateway, session, rgb, depth):
+    session.track(rgb, depth, SECOND)
+    gone, other = used(gateway, session)
+    gone.leave()
+
+    reply = session.track(rgb, depth, 2 * SECOND)
+
+    assert reply.status is TrackingStatus.TRACKED
+    assert [request.frame.seq for request in other.requests] == [1]
+
+
+def test_without_a_tracker_a_live_frame_is_unavailable_and_may_come_again(
+    gateway, client, calibration, rgb, depth
+):
+    session = client.create_session(calibration, mode="live")
+    for tracker in gateway.trackers:
+        tracker.leave()
+
+    with pytest.raises(UnavailableError, match="no tracking worker"):
+        session.track(rgb, depth, SECOND)
+
+    assert not client.ready()
+    with open_bus([gateway.router]) as bus:
+        StandInTracker(bus, "tracker-9")
+        assert session.track(rgb, depth, SECOND).seq == 0
+
+
+def test_a_gateway_that_starts_again_takes_the_session_up(gateway, session, rgb, depth):
+    for i in range(12):
+        session.track(rgb, depth, (i + 1) * SECOND)
+    ports = (free_port(), free_port())
+
+    with (
+        gateway_process(gateway.router, ports),
+        Client(f"http://127.0.0.1:{ports[0]}") as client,
+    ):
+        while not client.ready():
+            time.sleep(0.02)
+        reply = client.session(session.name).track(rgb, depth, 100 * SECOND)
+
+    assert (reply.seq, reply.reference_seq) == (12, 10)
+    assert len(gateway.mapper.disk[session.name].entries) == 13
+
+
+def test_a_gateway_that_ends_finishes_what_is_in_flight(gateway, session, rgb, depth):
+    session.track(rgb, depth, SECOND)
+    for tracker in gateway.trackers:
+        tracker.delay_s = 0.3
+    replies = []
+    sender = threading.Thread(
+        target=lambda: replies.append(session.track(rgb, depth, 2 * SECOND)), daemon=True
+    )
+    sender.start()
+    time.sleep(0.1)
+
+    os.kill(gateway.pid, signal.SIGTERM)
+    sender.join(timeout=5.0)
+
+    assert [reply.seq for reply in replies] == [1]
+
+
+def test_entries_that_a_gone_mapper_did_not_take_go_to_the_next_owner(gateway, session, rgb, depth):
+    for i in range(3):
+        session.track(rgb, depth, (i + 1) * SECOND)
+    disk = gateway.mapper.disk
+    with open_bus([gateway.router]) as bus:
+        gateway.mapper.leave()
+        StandInMapper(bus, "mapper-1", disk)
+
+        replies = [session.track(rgb, depth, (i + 4) * SECOND) for i in range(3)]
+
+        assert [reply.seq for reply in replies] == [3, 4, 5]
+        assert session.info()["mapper"] == "mapper-1"
+        assert [e.record.seq for e in disk[session.name].entries] == list(range(6))
+
+
+def test_a_live_session_holds_its_frames_while_the_map_has_no_owner(
+    gateway, client, calibration, rgb, depth
+):
+    session = client.create_session(calibration, mode="live")
+    session.track(rgb, depth, SECOND)
+    session.wait_until_mapped()
+    disk = gateway.mapper.disk
+    gateway.mapper.leave()
+
+    replies = [session.track(rgb, depth, (i + 2) * SECOND) for i in range(3)]
+
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+    with open_bus([gateway.router]) as bus:
+        StandInMapper(bus, "mapper-1", disk)
+        session.wait_until_mapped()
+        assert [e.record.seq for e in disk[session.name].entries] == [0, 1, 2, 3]
