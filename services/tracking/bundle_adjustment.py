@@ -19,8 +19,9 @@ from services.tracking.bundle_kernels import (
     linearise,
 )
 from services.tracking.config import BundleAdjustmentConfig
+from services.tracking.twists import exp_twist, log_twist
 from shared.camera import Intrinsics
-from shared.se3 import exp, inverse, log
+from shared.se3 import inverse
 
 _MAX_DAMPING = 1e6
 
@@ -114,7 +115,9 @@ class _Solver:
 
     def _steps(self, state: _State) -> NDArray[np.float64]:
         start = inverse(self._problem.T_world_priors)
-        return np.array([log(a @ b) for a, b in zip(start, state.T_world_cameras, strict=True)])
+        return np.array(
+            [log_twist(a @ b) for a, b in zip(start, state.T_world_cameras, strict=True)]
+        )
 
     def linearise(self, state: _State) -> _System:
         p = self._problem
@@ -163,6 +166,7 @@ class _Solver:
             Hpp_inverse, system.Hcp, system.bp, p.camera_index, self._starts, twists
         )
         poses = [
-            T @ exp(t) for T, t in zip(state.T_world_cameras, twists.reshape(-1, 6), strict=True)
+            T @ exp_twist(t)
+            for T, t in zip(state.T_world_cameras, twists.reshape(-1, 6), strict=True)
         ]
         return _State(np.array(poses), state.points_world + moves)

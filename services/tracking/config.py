@@ -36,14 +36,14 @@ class RegistrationConfig:
     """Coarse-to-fine point-to-plane registration to the local map."""
 
     voxel_sizes_m: tuple[float, ...] = (0.20, 0.10, 0.05)
-    sample_steps: tuple[int, ...] = (4, 2, 1)
+    sample_steps: tuple[int, ...] = (8, 4, 2)
     max_iterations: tuple[int, ...] = (8, 8, 12)
     min_normal_cos: float = 0.7
     depth_sigma_floor_m: float = 0.002
     depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
     kernel_width: float = 2.0  # of the robust kernel, in residual scales
-    translation_tolerance_m: float = 5e-5
-    rotation_tolerance_rad: float = 5e-5
+    translation_tolerance_m: float = 2e-4
+    rotation_tolerance_rad: float = 2e-4
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
     effective_share: float = 0.02  # residuals of neighbours are not independent
     model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas

@@ -17,8 +17,9 @@ from services.tracking.config import RefinementConfig
 from services.tracking.matching import Matches
 from services.tracking.orb import Features
 from services.tracking.registration import Registration
+from services.tracking.twists import exp_twist, inverse_rigid, log_twist
 from shared.camera import Intrinsics
-from shared.se3 import exp, inverse, log
+from shared.se3 import inverse
 from shared.tracks import Landmarks
 
 
@@ -36,7 +37,7 @@ class PoseObservations:
 
 @dataclass(frozen=True)
 class Refinement:
-    """A refined pose with its information (of a camera twist) and the observations it agrees with."""
+    """A refined pose, its information (of a camera twist) and which observations agree."""
 
     T_world_camera: NDArray[np.float64]  # [4, 4]
     information: NDArray[np.float64]  # [6, 6]
@@ -99,7 +100,7 @@ def _minimise(
     for _ in range(config.iterations):
         diagonal = np.diag(np.diag(H) * damping + 1e-9)
         twist = -np.linalg.solve(H + diagonal, b)
-        T_new = T @ exp(twist)
+        T_new = T @ exp_twist(twist)
         H_new, b_new, cost_new = _with_prior(
             observations, is_used, registration, T_new, camera, config
         )
@@ -121,7 +122,7 @@ def _with_prior(
     config: RefinementConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     H, b, cost = _linear_system(observations, is_used, T, camera, config)
-    step = log(inverse(registration.T_world_camera) @ T)
+    step = log_twist(inverse_rigid(registration.T_world_camera) @ T)
     pull = registration.information @ step
     cost += float(step @ pull) + 2.0 * float(registration.gradient @ step)
     return H + registration.information, b + pull + registration.gradient, cost
@@ -143,7 +144,7 @@ def _linear_system(
         o.depths_m,
         o.depth_sigmas_m,
         is_used,
-        inverse(T),
+        inverse_rigid(T),
         camera,
         config.huber_sigma,
     )

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import RegistrationConfig
+from services.tracking.twists import exp_twist
 from services.tracking.voxel_map import VoxelLevel, VoxelMap, cell_key, find_slot, main_axis
-from shared.se3 import exp, orthonormalise
+from shared.se3 import orthonormalise
 from shared.tracks import PointCloud
 
 
@@ -64,7 +65,7 @@ def _align_level(
     for _ in range(iterations):
         H, b, _, _ = _normal_equations(points, normals, level, T, config)
         twist = _well_determined_step(H, b, config.min_eigenvalue_share)
-        T = T @ exp(twist)
+        T = T @ exp_twist(twist)
         if (
             np.linalg.norm(twist[:3]) < config.translation_tolerance_m
             and np.linalg.norm(twist[3:]) < config.rotation_tolerance_rad
@@ -77,9 +78,11 @@ def linearise(
     source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
 ) -> Registration:
     """The registration's cost around a pose, without a step."""
-    H, b, overlap, scale = _normal_equations(source.points, source.normals, level, T, config)
+    step = config.sample_steps[-1]
+    points, normals = source.points[::step], source.normals[::step]
+    H, b, overlap, scale = _normal_equations(points, normals, level, T, config)
     sigma = max(scale, config.model_sigma)
-    factor = config.effective_share / sigma**2
+    factor = step * config.effective_share / sigma**2
     return Registration(T, factor * H, factor * b, overlap, scale)
 
 
@@ -88,7 +91,7 @@ def optimum(registration: Registration, config: RegistrationConfig) -> NDArray[n
     step = _well_determined_step(
         registration.information, registration.gradient, config.min_eigenvalue_share
     )
-    return registration.T_world_camera @ exp(step)
+    return registration.T_world_camera @ exp_twist(step)
 
 
 def _normal_equations(
@@ -147,9 +150,9 @@ def _correspond(
         nx = T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2]
         ny = T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2]
         nz = T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2]
-        i0 = np.int64(np.floor(x / size - 0.5))
-        j0 = np.int64(np.floor(y / size - 0.5))
-        k0 = np.int64(np.floor(z / size - 0.5))
+        cell_x, step_x, reach_x = _cell_and_neighbour(x, size)
+        cell_y, step_y, reach_y = _cell_and_neighbour(y, size)
+        cell_z, step_z, reach_z = _cell_and_neighbour(z, size)
         first = main_axis(nx, ny, nz)
         second = _second_axis(nx, ny, nz, first)
         best = np.inf
@@ -159,8 +162,11 @@ def _correspond(
             if direction < 0:
                 break
             for corner in range(8):
+                bx, by, bz = corner & 1, (corner >> 1) & 1, corner >> 2
+                if bx * reach_x + by * reach_y + bz * reach_z >= best:
+                    continue  # nothing in that voxel can be nearer
                 key = cell_key(
-                    direction, i0 + (corner & 1), j0 + ((corner >> 1) & 1), k0 + (corner >> 2)
+                    direction, cell_x + bx * step_x, cell_y + by * step_y, cell_z + bz * step_z
                 )
                 slot = find_slot(keys, key)
                 if keys[slot] == -1:
@@ -186,6 +192,16 @@ def _correspond(
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+def _cell_and_neighbour(x, size):  # pragma: no cover - compiled
+    """The cell of a coordinate, the step to the nearer neighbour, and its squared distance."""
+    cell = np.floor(x / size)
+    rest = x - cell * size
+    if rest > 0.5 * size:
+        return np.int64(cell), 1, (size - rest) ** 2
+    return np.int64(cell), -1, rest**2
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def _second_axis(x, y, z, first):  # pragma: no cover - compiled
     """The next axis direction where it is nearly as close as the first, else -1."""
     values = (x, y, z)
@@ -196,7 +212,7 @@ def _second_axis(x, y, z, first):  # pragma: no cover - compiled
         if i != first >> 1 and abs(values[i]) > best:
             best = abs(values[i])
             axis = i
-    if best < 0.7 * largest:
+    if best < 0.8 * largest:
         return -1
     return 2 * axis + (1 if values[axis] > 0.0 else 0)
 

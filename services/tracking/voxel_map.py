@@ -70,6 +70,22 @@ def find_slot(keys, key):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
+def _compact(keys, rows, used):  # pragma: no cover - compiled
+    """The same table in no more memory than its voxels need: look-ups stay in the cache."""
+    capacity = 16
+    while capacity < 3 * used:
+        capacity *= 2
+    small_keys = np.full(capacity, -1, np.int64)
+    small_rows = np.zeros(capacity, np.int32)
+    for n in range(len(keys)):
+        if keys[n] != -1:
+            slot = find_slot(small_keys, keys[n])
+            small_keys[slot] = keys[n]
+            small_rows[slot] = rows[n]
+    return small_keys, small_rows
+
+
+@numba.njit(cache=True, nogil=True)
 def _fill(points, normals, voxel_size):  # pragma: no cover - compiled
     count = len(points)
     capacity = 16
@@ -97,6 +113,7 @@ def _fill(points, normals, voxel_size):  # pragma: no cover - compiled
             row[axis] += p[axis]
             row[3 + axis] += m[axis]
         row[6] += 1.0
+    keys, rows = _compact(keys, rows, used)
     means = np.empty((used, 3), np.float32)
     directions = np.empty((used, 3), np.float32)
     for n in range(used):
