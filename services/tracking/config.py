@@ -42,6 +42,7 @@ class RegistrationConfig:
     depth_sigma_floor_m: float = 0.002
     depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
     kernel_width: float = 2.0  # of the robust kernel, in residual scales
+    min_kernel_width: float = 0.1  # in depth sigmas: exact depth still meets rounded edges
     translation_tolerance_m: float = 2e-4
     rotation_tolerance_rad: float = 2e-4
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction

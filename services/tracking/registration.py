@@ -117,7 +117,7 @@ def _normal_equations(
     if len(found) < 30:
         return np.zeros((6, 6)), np.zeros(6), 0.0, 1.0
     scale = 1.4826 * float(np.median(np.abs(residuals[found])))
-    width = config.kernel_width * max(scale, 1e-3)
+    width = max(config.kernel_width * scale, config.min_kernel_width)
     H, b = _accumulate(points, directions, residuals, found, width)
     return H, b, len(found) / len(points), scale
 
