@@ -1,0 +1,152 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from shared.errors import InputError
+from shared.frames import ColourEncoding, ColourImage, DepthEncoding, DepthImage, TrackingStatus
+from shared.se3 import angle_rad, exp, inverse
+
+STEP = np.array([0.02, -0.005, 0.015, 0.004, 0.012, -0.003])
+
+
+def path(index: int) -> np.ndarray:
+    return exp(index * STEP)
+
+
+def error(T: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
+    difference = inverse(T_true) @ T
+    return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(angle_rad(difference)))
+
+
+def empty_depth(frame):
+    nothing = DepthImage(DepthEncoding.RAW16, bytes(len(frame.depth.bytes)))
+    return dataclasses.replace(frame, depth=nothing)
+
+
+def blind(frame):
+    black = ColourImage(ColourEncoding.RGB8, bytes(len(frame.rgb.bytes)))
+    return dataclasses.replace(empty_depth(frame), rgb=black)
+
+
+def test_poses_of_a_walk_through_the_room_are_within_two_millimetres(room, session):
+    results = [session.track(room.frame(i, path(i))) for i in range(25)]
+
+    errors = [error(r.T_world_camera, path(i)) for i, r in enumerate(results)]
+    assert {r.status for r in results} == {TrackingStatus.TRACKED}
+    assert max(metres for metres, _ in errors) < 0.002
+    assert max(degrees for _, degrees in errors) < 0.1
+
+
+def test_the_first_frame_founds_the_world(room, session):
+    result = session.track(room.frame(3, np.eye(4)))
+
+    assert result.status is TrackingStatus.TRACKED
+    assert result.keyframe is not None
+    assert result.reference_seq == 3
+    np.testing.assert_array_equal(result.T_world_camera, np.eye(4))
+
+
+def test_a_first_frame_that_may_not_enter_the_map_has_no_answer_yet(room, session):
+    frame = dataclasses.replace(room.frame(0, np.eye(4)), may_be_keyframe=False)
+
+    assert session.track(frame).status is TrackingStatus.NEED_FRAMES
+
+
+def test_a_first_frame_without_depth_has_no_answer_yet(room, session):
+    result = session.track(empty_depth(room.frame(0, np.eye(4))))
+
+    assert result.status is TrackingStatus.NEED_FRAMES
+
+
+def test_a_blind_frame_is_lost_and_repeats_the_pose_before_it(room, session):
+    for i in range(3):
+        before = session.track(room.frame(i, path(i)))
+
+    result = session.track(blind(room.frame(3, path(3))))
+
+    assert result.status is TrackingStatus.LOST
+    np.testing.assert_array_equal(result.T_world_camera, before.T_world_camera)
+    assert result.keyframe is None
+
+
+def test_tracking_goes_on_after_blind_frames(room, session):
+    for i in range(3):
+        session.track(room.frame(i, path(i)))
+    for i in range(3, 6):
+        session.track(blind(room.frame(i, path(i))))
+
+    result = session.track(room.frame(6, path(6)))
+
+    assert result.status in (TrackingStatus.TRACKED, TrackingStatus.RELOCALISED)
+    assert error(result.T_world_camera, path(6))[0] < 0.002
+
+
+def test_a_kidnapped_camera_finds_itself_in_the_map(room, session):
+    away = exp([0.2, 0.0, -0.3, 0.0, 1.6, 0.0])
+    for i in range(3):
+        session.track(room.frame(i, path(i)))
+    session.prior = dataclasses.replace(session.prior, T_world_camera=away, lost_frames=5)
+
+    result = session.track(room.frame(3, path(4)))
+
+    assert result.status in (TrackingStatus.TRACKED, TrackingStatus.RELOCALISED)
+    assert error(result.T_world_camera, path(4))[0] < 0.005
+
+
+def test_a_large_step_is_found_by_its_features(room, session):
+    far = exp([0.25, 0.05, -0.2, 0.05, 0.3, 0.02])
+    session.track(room.frame(0, np.eye(4)))
+
+    result = session.track(room.frame(1, far))
+
+    assert result.status is TrackingStatus.TRACKED
+    assert error(result.T_world_camera, far)[0] < 0.003
+
+
+def test_the_pose_is_told_relative_to_its_reference(room, session):
+    for i in range(8):
+        result = session.track(room.frame(i, path(i)))
+
+    told = session.store.pose(result.reference_seq) @ result.T_reference_camera
+    np.testing.assert_allclose(told, result.T_world_camera, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_a_pose_known_to_millimetres(room, session):
+    for i in range(3):
+        result = session.track(room.frame(i, path(i)))
+
+    np.testing.assert_allclose(result.covariance, result.covariance.T, atol=1e-12)
+    assert np.linalg.eigvalsh(result.covariance).min() > 0.0
+    assert np.sqrt(np.diag(result.covariance)[:3]).max() < 0.005
+
+
+def test_the_same_request_gives_the_same_bits(room, session):
+    for i in range(4):
+        session.track(room.frame(i, path(i)))
+    frame = room.frame(14, path(12))
+
+    first, second = session.answer(frame), session.answer(frame)
+
+    np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    assert first.keyframe is not None and second.keyframe is not None
+    np.testing.assert_array_equal(
+        first.keyframe.correction.positions_world, second.keyframe.correction.positions_world
+    )
+
+
+def test_every_stage_is_timed(room, session):
+    for i in range(2):
+        result = session.track(room.frame(i, path(i)))
+
+    stages = {"decode", "points", "orb", "context", "coarse", "refine", "keyframe", "total"}
+    assert stages <= set(result.timings_ms)
+
+
+def test_a_truncated_depth_image_is_refused_by_name(room, session):
+    frame = room.frame(0, np.eye(4))
+    cut = DepthImage(DepthEncoding.RAW16, frame.depth.bytes[:-10])
+
+    with pytest.raises(InputError, match="depth.bytes"):
+        session.track(dataclasses.replace(frame, depth=cut))
