@@ -347,14 +347,20 @@ def test_a_client_that_never_reads_is_cut_off_and_the_session_goes_on(gateway, o
     assert post(gateway, offline, codec.pack(good)).status_code == 200
 
 
+def receive(connection):
+    data = connection.recv()
+    assert isinstance(data, bytes)
+    return codec.unpack(FrameReply, data)
+
+
 def test_a_text_message_on_the_stream_is_refused_and_the_stream_goes_on(gateway, offline, good):
     url = f"{gateway.url.replace('http', 'ws')}/v1/sessions/{offline.name}/stream"
     with open_stream(url) as connection:
         connection.send("hello")
-        refused = codec.unpack(FrameReply, bytes(connection.recv()))
+        refused = receive(connection)
         connection.send(codec.pack(good))
 
-        answered = codec.unpack(FrameReply, bytes(connection.recv()))
+        answered = receive(connection)
 
     assert refused.error is not None
     assert (refused.error.field, refused.error.reason) == ("message", "must be a binary message")

@@ -1,5 +1,7 @@
 """The gRPC services against a real gateway process."""
 
+from typing import Any
+
 import grpc
 import numpy as np
 import pytest
@@ -174,8 +176,8 @@ def test_the_exported_map_comes_in_pieces(track, maps, name):
 def refused(call):
     with pytest.raises(grpc.RpcError) as caught:
         call()
-    fields = dict(caught.value.trailing_metadata() or ())
-    return caught.value.code(), fields.get("pointslam-field")
+    error: Any = caught.value
+    return error.code(), dict(error.trailing_metadata()).get("pointslam-field")
 
 
 def test_an_unknown_session_is_not_found(poses):
@@ -223,7 +225,7 @@ def test_a_message_over_the_limit_is_refused(channel, name):
 
 
 def test_health_says_serving_for_each_service(channel):
-    stub = health_pb2_grpc.HealthStub(channel)
+    stub: Any = health_pb2_grpc.HealthStub(channel)
 
     for service in ("", "pointslam.v1.TrackingService", "pointslam.v1.MapService"):
         reply = stub.Check(health_pb2.HealthCheckRequest(service=service))
@@ -232,7 +234,7 @@ def test_health_says_serving_for_each_service(channel):
 
 
 def test_reflection_lists_the_services(channel):
-    stub = reflection_pb2_grpc.ServerReflectionStub(channel)
+    stub: Any = reflection_pb2_grpc.ServerReflectionStub(channel)
     request = reflection_pb2.ServerReflectionRequest(list_services="")
 
     (reply,) = stub.ServerReflectionInfo(iter([request]))

@@ -1,0 +1,234 @@
+"""The bus on a real router: replies, errors, silence, pieces, publications, liveliness."""
+
+import asyncio
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from benchmarks.local_gateway import free_port
+from shared.bus import open_bus, open_router
+from shared.errors import (
+    ConflictError,
+    GoneError,
+    InputError,
+    NotFoundError,
+    PointSlamError,
+    StorageError,
+    TimedOutError,
+    UnavailableError,
+)
+from shared.maps import DeleteRequest, Empty
+
+KEY = "ps/test/question"
+
+
+@pytest.fixture(scope="module")
+def endpoint():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_router(endpoint)
+    yield endpoint
+    router.close()
+
+
+@pytest.fixture
+def bus(endpoint):
+    with open_bus([endpoint]) as bus:
+        yield bus
+
+
+@pytest.fixture
+def other(endpoint):
+    with open_bus([endpoint]) as bus:
+        yield bus
+
+
+def ask(bus, timeout_s=2.0):
+    return bus.query(KEY, DeleteRequest("x"), DeleteRequest, timeout_s)
+
+
+def test_a_query_is_answered(bus, other):
+    other.serve(KEY, DeleteRequest, lambda request: DeleteRequest(request.session + "!"))
+
+    assert ask(bus) == DeleteRequest("x!")
+
+
+def test_an_asynchronous_query_is_answered(bus, other):
+    other.serve(KEY, DeleteRequest, lambda request: request)
+
+    async def run():
+        return await asyncio.gather(
+            *[bus.ask(KEY, DeleteRequest(str(i)), DeleteRequest, 2.0) for i in range(20)]
+        )
+
+    assert [reply.session for reply in asyncio.run(run())] == [str(i) for i in range(20)]
+
+
+def test_a_reply_may_come_in_pieces(bus, other):
+    other.serve(KEY, DeleteRequest, lambda _: (DeleteRequest(str(i)) for i in range(5)))
+
+    async def run():
+        pieces = bus.ask_stream(KEY, DeleteRequest("x"), DeleteRequest, 2.0)
+        return [piece.session async for piece in pieces]
+
+    assert asyncio.run(run()) == ["0", "1", "2", "3", "4"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InputError("frame.seq", "must grow"),
+        NotFoundError("no such thing"),
+        ConflictError("there already"),
+        UnavailableError("later"),
+        StorageError("disk full"),
+    ],
+    ids=lambda error: error.code,
+)
+def test_an_error_arrives_as_its_own_class_with_its_text(bus, other, error):
+    def answer(_):
+        raise error
+
+    other.serve(KEY, DeleteRequest, answer)
+
+    with pytest.raises(type(error)) as caught:
+        ask(bus)
+    assert str(caught.value) == str(error)
+
+
+def test_a_fault_of_the_other_side_tells_nothing_of_its_inside(bus, other):
+    other.serve(KEY, DeleteRequest, lambda _: 1 / 0)
+
+    with pytest.raises(PointSlamError, match="internal error") as caught:
+        ask(bus)
+    assert "division" not in str(caught.value)
+
+
+def test_a_message_of_the_wrong_kind_is_refused_by_field(bus, other):
+    other.serve(KEY, Empty, lambda request: request)
+
+    with pytest.raises(InputError, match="unknown field") as caught:
+        ask(bus)
+    assert caught.value.field == "Empty.session"
+
+
+def test_nobody_there_is_gone_at_once(bus):
+    start = time.monotonic()
+
+    with pytest.raises(GoneError):
+        ask(bus, timeout_s=5.0)
+
+    assert time.monotonic() - start < 1.0
+
+
+def test_one_that_leaves_in_the_middle_is_gone(bus, endpoint):
+    other = open_bus([endpoint])
+    asked = threading.Event()
+
+    def answer(request):
+        asked.set()
+        time.sleep(0.5)
+        return request
+
+    with ThreadPoolExecutor() as pool:
+        stop = other.serve(KEY, DeleteRequest, answer, pool)
+        stop()
+
+    with pytest.raises(GoneError):
+        ask(bus)
+    other.close()
+
+
+def test_one_that_is_too_slow_times_out(bus, other):
+    other.serve(KEY, DeleteRequest, lambda request: time.sleep(0.6) or request)
+
+    with pytest.raises(TimedOutError):
+        ask(bus, timeout_s=0.2)
+
+
+def test_an_executor_answers_several_at_a_time(bus, other):
+    barrier = threading.Barrier(2, timeout=5.0)
+
+    def answer(request):
+        barrier.wait()
+        return request
+
+    with ThreadPoolExecutor(2) as pool:
+        other.serve(KEY, DeleteRequest, answer, pool)
+
+        async def run():
+            question = bus.ask(KEY, DeleteRequest("x"), DeleteRequest, 5.0)
+            return await asyncio.gather(
+                question, bus.ask(KEY, DeleteRequest("y"), DeleteRequest, 5.0)
+            )
+
+        replies = asyncio.run(run())
+
+    assert {reply.session for reply in replies} == {"x", "y"}
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 5.0
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert condition()
+
+
+def test_publications_reach_who_listens(bus, other):
+    heard = []
+    other.subscribe("ps/test/news", DeleteRequest, heard.append)
+
+    def publish():
+        bus.publish("ps/test/news", DeleteRequest("now"))
+        return heard
+
+    wait_for(publish)
+    assert heard[0] == DeleteRequest("now")
+
+
+def test_a_publication_of_the_wrong_kind_is_dropped(bus, other):
+    heard = []
+    other.subscribe("ps/test/news", Empty, heard.append)
+
+    def publish():
+        bus.publish("ps/test/news", DeleteRequest("now"))
+        bus.publish("ps/test/news", Empty())
+        return heard
+
+    wait_for(publish)
+    assert set(map(type, heard)) == {Empty}
+
+
+def test_a_process_is_alive_until_it_leaves(bus, endpoint):
+    alive = set()
+    bus.watch_alive(
+        "testing", lambda name, is_alive: (alive.add if is_alive else alive.discard)(name)
+    )
+
+    with open_bus([endpoint]) as other:
+        other.declare_alive("testing", "one")
+        wait_for(lambda: alive == {"one"})
+
+    wait_for(lambda: alive == set())
+
+
+def test_one_who_comes_late_hears_of_those_alive(bus, other):
+    other.declare_alive("testing", "one")
+    alive = set()
+
+    bus.watch_alive("testing", lambda name, is_alive: alive.add(name))
+
+    wait_for(lambda: alive == {"one"})
+
+
+def test_a_router_that_is_not_there_is_unavailable():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    with pytest.raises(UnavailableError, match=endpoint):
+        open_bus([endpoint], wait_s=0.1)
+
+
+def test_a_taken_endpoint_is_unavailable(endpoint):
+    with pytest.raises(UnavailableError, match="cannot listen"):
+        open_router(endpoint)
