@@ -69,7 +69,7 @@ def seed_anchors(
     return NewAnchors(
         positions=positions,
         features=_features(samples.colours[picks], rng),
-        offsets=offsets.reshape(len(starts), -1).astype(np.float32),
+        offsets=offsets.reshape(-1, 3 * config.children).astype(np.float32),
         scalings=_scalings(sides, spacing, counts, config),
         keys=samples.keys[starts],
         is_primary=samples.is_landmark[starts],
@@ -150,7 +150,7 @@ def _features(colours: NDArray[np.float32], rng: np.random.Generator) -> NDArray
     count, children = colours.shape[:2]
     features = rng.normal(0.0, 0.1, (count, FEATURES)).astype(np.float32)
     clipped = np.clip(colours, _COLOUR_MARGIN, 1.0 - _COLOUR_MARGIN)
-    features[:, : 3 * children] = np.log(clipped / (1.0 - clipped)).reshape(count, -1)
+    features[:, : 3 * children] = np.log(clipped / (1.0 - clipped)).reshape(count, 3 * children)
     return features
 
 

@@ -1,0 +1,75 @@
+"""Files that other programs read."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from services.mapping.export import chunks, ply_bytes
+from services.mapping.rasterizer import Gaussians
+
+
+def gaussians(count: int = 4) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(count, 4, generator=generator)
+    return Gaussians(
+        means=torch.randn(count, 3, generator=generator),
+        scales=torch.rand(count, 3, generator=generator) + 0.01,
+        quats_wxyz=quats,
+        opacities=torch.linspace(0.1, 0.9, count),
+        colours=torch.rand(count, 3, generator=generator),
+    )
+
+
+def read_ply(data: bytes) -> np.ndarray:
+    """The vertices of a binary PLY, by the names in its own header."""
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    names = [line.split()[2] for line in lines if line.startswith("property float")]
+    vertices = np.frombuffer(body, [(name, "<f4") for name in names])
+    assert f"element vertex {len(vertices)}" in lines
+    return vertices
+
+
+def test_a_ply_holds_what_3dgs_viewers_expect():
+    vertices = read_ply(ply_bytes(gaussians()))
+
+    assert vertices.dtype.names == (
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+        *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    )
+
+
+def test_a_viewer_computes_the_maps_values_from_the_ply():
+    expected = gaussians()
+
+    vertices = read_ply(ply_bytes(expected))
+
+    stack = lambda *names: np.stack([vertices[name] for name in names], axis=1)  # noqa: E731
+    colours = 0.5 + 0.28209479 * stack("f_dc_0", "f_dc_1", "f_dc_2")
+    scales = np.exp(stack("scale_0", "scale_1", "scale_2"))
+    quats = expected.quats_wxyz / expected.quats_wxyz.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose(stack("x", "y", "z"), expected.means)
+    np.testing.assert_allclose(colours, expected.colours, atol=1e-6)
+    np.testing.assert_allclose(scales, expected.scales, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertices["opacity"])), expected.opacities, 1e-5)
+    np.testing.assert_allclose(stack("rot_0", "rot_1", "rot_2", "rot_3"), quats, atol=1e-6)
+
+
+def test_a_map_of_nothing_is_a_ply_without_vertices():
+    assert len(read_ply(ply_bytes(gaussians(0)))) == 0
+
+
+def test_pieces_join_to_the_file():
+    data = bytes(range(256)) * 5
+
+    pieces = list(chunks(data, 100))
+
+    assert b"".join(piece.bytes for piece in pieces) == data
+    assert [piece.offset for piece in pieces] == list(range(0, 1280, 100))
+    assert {piece.total for piece in pieces} == {1280}
+
+
+def test_an_empty_file_is_one_empty_piece():
+    assert [piece.total for piece in chunks(b"", 100)] == [0]

@@ -1,0 +1,167 @@
+"""The mapper as a whole: a few frames of a known room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from services.mapping import densification
+from services.mapping.config import DensificationConfig, MappingConfig, ScheduleConfig
+from services.mapping.export import bake
+from services.mapping.pipeline import Mapper, NewKeyframe
+from shared import se3
+from shared.maps import RenderRequest
+from shared.tracks import KeyframePoses
+
+
+@pytest.fixture
+def mapper(calibration) -> Mapper:
+    return Mapper(calibration, MappingConfig(), 0, torch.device("cpu"))
+
+
+@pytest.fixture
+def insert(frame, true_pose):
+    """Inserts a keyframe at its true pose; others may be given new poses."""
+
+    def run(mapper: Mapper, seq: int, **moved: np.ndarray) -> int:
+        seqs = [*mapper.views.seqs(), seq]
+        poses = np.stack([moved.get(f"at_{s}", true_pose(s)) for s in seqs])
+        keyframe_poses = KeyframePoses(len(seqs), np.array(seqs), poses)
+        return mapper.insert_keyframe(NewKeyframe(frame(seq), keyframe_poses, np.zeros((0, 3))))
+
+    return run
+
+
+@pytest.fixture
+def psnr_db(calibration, true_pose, true_colour):
+    """PSNR of a rendered frame against its exact colours."""
+
+    def score(mapper: Mapper, seq: int) -> float:
+        request = RenderRequest(true_pose(seq), calibration.colour.intrinsics)
+        error = mapper.render(request).rgb / 255.0 - true_colour(seq) / 255.0
+        return float(-10 * np.log10(np.mean(error**2)))
+
+    return score
+
+
+def test_a_view_between_keyframes_is_rendered_well_after_a_few_iterations(mapper, insert, psnr_db):
+    for seq in (0, 4, 8):
+        insert(mapper, seq)
+        mapper.iterate(30)
+
+    assert psnr_db(mapper, 6) > 30.0
+
+
+def test_rendered_depth_is_the_measured_depth(mapper, insert, calibration, true_pose):
+    insert(mapper, 0)
+    mapper.iterate(60)
+
+    reply = mapper.render(RenderRequest(true_pose(0), calibration.colour.intrinsics))
+
+    image = mapper.views.image(0)
+    solid = reply.alpha > 200
+    assert solid.mean() > 0.9
+    assert np.abs(reply.depth_m - image.depth_m)[solid].mean() < 0.02
+
+
+def test_a_second_look_at_the_same_place_adds_hardly_any_anchor(mapper, insert):
+    first = insert(mapper, 0)
+    mapper.iterate(30)
+
+    second = insert(mapper, 1)
+
+    assert second < 0.15 * first
+
+
+def test_a_correction_moves_the_keyframes_anchors(mapper, insert, true_pose):
+    insert(mapper, 0)
+    before = mapper.anchors.rows["position"].clone()
+    moved = se3.exp([0.05, 0, 0, 0, 0, 0]) @ true_pose(0)
+
+    insert(mapper, 4, at_0=moved)
+
+    shift = mapper.anchors.rows["position"][: len(before)] - before
+    torch.testing.assert_close(shift, torch.tensor([[0.05, 0.0, 0.0]]).expand_as(shift))
+
+
+def test_a_correction_of_a_millimetre_moves_no_anchor(mapper, insert, true_pose):
+    insert(mapper, 0)
+    before = mapper.anchors.rows["position"].clone()
+
+    insert(mapper, 4, at_0=se3.exp([0.001, 0, 0, 0, 0, 0]) @ true_pose(0))
+
+    assert torch.equal(mapper.anchors.rows["position"][: len(before)], before)
+
+
+def test_the_newest_keyframe_gets_its_share_of_draws(mapper, insert):
+    for seq in (0, 4, 8, 12):
+        insert(mapper, seq)
+
+    draws = [mapper.views.draw().seq for _ in range(2000)]
+
+    expected = ScheduleConfig().newest_share + (1 - ScheduleConfig().newest_share) / 4
+    assert np.mean(np.array(draws) == 12) == pytest.approx(expected, abs=0.04)
+
+
+def test_a_refinement_sees_every_keyframe_once_a_round(mapper, insert):
+    for seq in (0, 4, 8, 12):
+        insert(mapper, seq)
+
+    assert sorted(mapper.views.draw_in_rounds().seq for _ in range(4)) == [0, 4, 8, 12]
+
+
+def test_faint_anchors_are_culled_but_primary_ones_stay(mapper, insert):
+    insert(mapper, 0)
+    rows = mapper.anchors.rows
+    rows["visits"][:10] = 100.0
+    rows["is_primary"][:4] = True
+    before = len(rows)
+
+    culled = densification.cull(mapper.anchors, DensificationConfig())
+
+    assert (culled, len(rows)) == (6, before - 6)
+
+
+def test_anchors_grow_where_the_screen_gradient_is_large(mapper, insert):
+    insert(mapper, 0)
+    rows = mapper.anchors.rows
+    rows["gradient_visits"][:] = 20.0
+    rows["gradient_sum"][3, 1] = 1.0
+    config = DensificationConfig(grow_share=1.0)
+    child = rows["offsets"][3].view(5, 3)[1] * rows["scalings"][3, :3].exp()
+    place = rows["position"][3] + child
+    side = rows["scalings"][3, 0].exp() / 2
+
+    added = densification.grow(
+        mapper.anchors, config, mapper.config.anchors, np.random.default_rng(0)
+    )
+
+    assert added == 1
+    assert (mapper.anchors.rows["position"][-1] - place).abs().max() <= side / 2 + 1e-6
+
+
+def test_a_baked_map_holds_only_gaussians_that_show(mapper, insert):
+    insert(mapper, 0)
+    mapper.iterate(10)
+
+    gaussians = bake(mapper)
+
+    assert 0 < len(gaussians.means) <= 5 * len(mapper.anchors)
+    assert gaussians.opacities.min() > 1 / 255
+
+
+def test_a_map_without_keyframes_bakes_to_nothing(mapper):
+    assert len(bake(mapper).means) == 0
+
+
+def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose):
+    blind = frame(0)
+    depth = type(blind.depth)(blind.depth.encoding, bytes(len(blind.depth.bytes)))
+    keyframe = type(blind)(0, 0, blind.rgb, depth)
+    poses = KeyframePoses(1, np.array([0]), true_pose(0)[None])
+
+    added = mapper.insert_keyframe(NewKeyframe(keyframe, poses, np.zeros((0, 3))))
+    mapper.iterate(2)
+
+    assert added == 0
