@@ -82,7 +82,7 @@ def refine_pose(
     for _ in range(config.rounds):
         T = _minimise(observations, is_inlier, registration, T, camera, config)
         is_inlier = _chi2(observations, T, camera) < config.outlier_chi2
-    H, _, _ = _linear_system(observations, is_inlier, T, camera, config)
+    H, _, _ = linear_system(observations, is_inlier, T, camera, config)
     return Refinement(T, H + registration.information, is_inlier)
 
 
@@ -121,20 +121,21 @@ def _with_prior(
     camera: NDArray[np.float64],
     config: RefinementConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    H, b, cost = _linear_system(observations, is_used, T, camera, config)
+    H, b, cost = linear_system(observations, is_used, T, camera, config)
     step = log_twist(inverse_rigid(registration.T_world_camera) @ T)
     pull = registration.information @ step
     cost += float(step @ pull) + 2.0 * float(registration.gradient @ step)
     return H + registration.information, b + pull + registration.gradient, cost
 
 
-def _linear_system(
+def linear_system(
     observations: PoseObservations,
     is_used: NDArray[np.bool_],
     T: NDArray[np.float64],
     camera: NDArray[np.float64],
     config: RefinementConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Normal equations (H, b) of a camera twist and the cost, whose gradient is 2 b."""
     o = observations
     return _accumulate(
         o.points_world,
