@@ -14,7 +14,7 @@ from pointslam.datasets.base import Sequence, is_held_out
 from pointslam.progress import describe
 from shared.errors import PointSlamError
 from shared.frames import TrackingStatus
-from shared.stream import FrameMessage, FrameReply
+from shared.stream import ErrorDetail, FrameMessage, FrameReply
 
 _INFO_EVERY_S = 1.0
 _OUTSIDE_WORKER = ("queue", "gateway", "total")
@@ -68,14 +68,19 @@ def stream_sequence(session: Session, sequence: Sequence, options: StreamOptions
     with tqdm(total=options.num_frames, desc="frames", unit="frame", dynamic_ncols=True) as bar:
         for reply in session.stream(frames):
             if reply.error is not None:
-                error = reply.error
-                raise PointSlamError(f"frame {reply.seq}: {error.field} {error.reason}")
+                raise _refused(sequence, len(replies), reply.error)
             replies.append(reply)
             bar.update(1)
             if time.monotonic() >= next_info:
                 bar.set_postfix_str(describe(session.info(), str(reply.status)))
                 next_info = time.monotonic() + _INFO_EVERY_S
     return StreamResult(tuple(replies), time.monotonic() - start)
+
+
+def _refused(sequence: Sequence, index: int, error: ErrorDetail) -> PointSlamError:
+    # Replies come in order, one a frame, also for frames that could not be read at all.
+    where = f"{sequence.name}, frame {index}, stamp {sequence.stamp(index)}"
+    return PointSlamError(f"{where}: {error.field}: {error.reason}")
 
 
 def _messages(
