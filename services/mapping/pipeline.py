@@ -22,6 +22,7 @@ from services.mapping.config import MappingConfig
 from services.mapping.coverage import uncovered_pixels
 from services.mapping.decoder import initial_weights, weight_optimizer
 from services.mapping.losses import Appearance, Target, mapping_loss
+from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.map_state import (
     MapState,
     as_arrays,
@@ -104,6 +105,7 @@ class Mapper:
             calibration, config.schedule, seed, lambda image: Target.of(image, device)
         )
         self._placed: dict[int, NDArray[np.float64]] = {}  # poses that the anchors are placed by
+        self._loss = mapping_loss_cpu if device.type == "cpu" else mapping_loss
         self._rng = np.random.default_rng([seed, 0])
         self._background = np.zeros(3, np.float32)
         self.iterations = 0
@@ -210,7 +212,7 @@ class Mapper:
             if len(drawn.visible.index) == 0:  # a keyframe without depth, far from the map
                 return
             with self.stages.stage("loss"):
-                loss = mapping_loss(drawn.rendered, target, appearance, self.config.loss)
+                loss = self._loss(drawn.rendered, target, appearance, self.config.loss)
             with self.stages.stage("backward"):
                 loss.total.backward()
             with self.stages.stage("update"):

@@ -11,6 +11,7 @@ import torch
 from services.mapping.appearance import IDENTITY, ExposureModel
 from services.mapping.config import LearningRates, LossConfig
 from services.mapping.losses import Appearance, Target, depth_error, mapping_loss
+from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.rasterizer import Rendered, ScreenStatistics
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
@@ -37,6 +38,26 @@ def perfect(image: RgbdImage) -> Rendered:
 @pytest.fixture
 def target(image) -> Target:
     return Target.of(image, torch.device("cpu"))
+
+
+def test_the_cpu_loss_and_its_gradients_equal_the_plain_ones(image):
+    generator = torch.Generator().manual_seed(0)
+    holes = image.depth_m.copy()
+    holes[3:6] = 0.0
+    target = Target.of(replace(image, depth_m=holes), torch.device("cpu"))
+    results = []
+    for function in (mapping_loss, mapping_loss_cpu):
+        generator.manual_seed(0)
+        shapes = (16, 20, 3), (16, 20), (16, 20), (2, 3)
+        leaves = [torch.rand(shape, generator=generator).requires_grad_() for shape in shapes]
+        rendered = Rendered(leaves[0], leaves[1] * 2, leaves[2], perfect(image).screen)
+        appearance = Appearance(torch.tensor([0.2, 0.4, 0.6]), leaves[3])
+        loss = function(rendered, target, appearance, replace(CONFIG, max_depth_error_m=1.0))
+        loss.total.backward()
+        results.append([loss.total, loss.squared_error, *(leaf.grad for leaf in leaves)])
+
+    for expected, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
 
 
 def test_a_perfect_render_has_no_loss(image, target):
