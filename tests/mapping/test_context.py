@@ -1,0 +1,207 @@
+import time
+
+import numpy as np
+import pytest
+
+from services.mapping.context import ContextConfig
+from services.mapping.keyframes import KeyframeConfig, KeyframeStore
+from services.mapping.voxel_merge import merge_clouds
+from shared.errors import ConfigError
+from shared.se3 import exp, inverse, transform
+from shared.tracks import (
+    KEYPOINT_BITS,
+    Correction,
+    KeyframeData,
+    Observations,
+    PointCloud,
+    landmark_id,
+)
+
+STEP_M = 0.1
+WALL_M = 2.01
+VISIBLE = 200  # landmarks in a row along the wall, one a centimetre
+
+
+def pose(index: int) -> np.ndarray:
+    return exp([index * STEP_M, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def wall_cloud(count: int = 4000, noise_m: float = 0.0, seed: int = 0) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1.0, -0.8, WALL_M], [1.0, 0.8, WALL_M], (count, 3))
+    points[:, 2] += rng.normal(0.0, noise_m, count)
+    return PointCloud(points.astype(np.float32), np.tile(np.float32([0, 0, -1]), (count, 1)))
+
+
+def keyframe(index: int, noise_m: float = 0.0) -> KeyframeData:
+    """Keyframe 10 * index at x = 0.1 * index, which sees landmarks 10 * index and 199 more.
+
+    Landmark j is j centimetres along the wall and was founded by the first keyframe to see it.
+    """
+    along = np.arange(10 * index, 10 * index + VISIBLE)
+    founder = np.maximum(0, -(-(along - VISIBLE + 1) // 10))
+    ids = (10 * founder).astype(np.int64) << KEYPOINT_BITS | along
+    positions = np.stack([along * 0.01 - 1.0, np.zeros(VISIBLE), np.full(VISIBLE, WALL_M)], axis=1)
+    own = transform(inverse(pose(index)), positions)
+    rng = np.random.default_rng(index)
+    return KeyframeData(
+        observations=Observations(
+            landmark_ids=ids,
+            keypoints_px=(500 * own[:, :2] / own[:, 2:] + 320).astype(np.float32),
+            octaves=np.full(VISIBLE, index % 8, np.uint8),
+            depths_m=own[:, 2].astype(np.float32),
+            descriptors=rng.integers(0, 256, (VISIBLE, 32)).astype(np.uint8),
+        ),
+        landmark_normals_camera=np.tile(np.float32([0, 0, -1]), (VISIBLE, 1)),
+        cloud_camera=wall_cloud(noise_m=noise_m, seed=index),
+        thumbnail=np.zeros((15, 20), np.uint8),
+        correction=Correction(np.array([10 * index], np.int64), pose(index)[None], ids, positions),
+    )
+
+
+def walk(count: int, config: ContextConfig | None = None, noise_m: float = 0.0) -> KeyframeStore:
+    store = KeyframeStore(KeyframeConfig(context=config or ContextConfig()))
+    for index in range(count):
+        store.insert(10 * index, index, pose(index), keyframe(index, noise_m))
+    return store
+
+
+def test_an_empty_map_has_an_empty_context():
+    context = KeyframeStore().context(-1)
+
+    assert context.num_keyframes == 0
+    assert len(context.cloud_world.points) == len(context.landmarks.ids) == 0
+
+
+def test_the_newest_keyframe_is_the_reference_where_none_is_named():
+    store = walk(3)
+
+    assert store.context(-1).reference_seq == 20
+    assert store.context(999).reference_seq == 20
+    assert store.context(10).reference_seq == 10
+
+
+def test_the_cloud_lies_on_the_wall_and_faces_the_camera():
+    cloud = walk(4).context(-1).cloud_world
+
+    np.testing.assert_allclose(cloud.points[:, 2], WALL_M, atol=1e-5)
+    np.testing.assert_allclose(cloud.normals, np.tile([0, 0, -1], (len(cloud.points), 1)))
+
+
+def test_keyframes_together_are_less_noisy_than_one():
+    one, many = (walk(n, noise_m=0.004).context(0).cloud_world.points[:, 2] for n in (1, 8))
+
+    assert np.abs(many - WALL_M).mean() < 0.7 * np.abs(one - WALL_M).mean()
+
+
+def test_only_keyframes_that_see_the_same_place_take_part():
+    store = walk(40)  # 4 m of wall, 2 m in view
+
+    cloud = store.context(0).cloud_world
+
+    assert cloud.points[:, 0].max() < 3.0
+    assert {k.seq for k in store.context(0).window} <= set(range(0, 200, 10))
+
+
+def test_a_keyframe_behind_the_wall_takes_no_part():
+    store = walk(1)
+    behind = pose(0) @ exp([0.0, 0.0, 4.0, 0.0, np.pi, 0.0])
+    store.insert(10, 0, behind, keyframe(0))
+
+    cloud = store.context(0).cloud_world
+
+    assert (cloud.normals[:, 2] < 0.0).all()
+
+
+def test_sizes_are_bounded():
+    config = ContextConfig(max_points=500, max_landmarks=50, max_keyframes=5)
+
+    context = walk(12, config).context(-1)
+
+    assert len(context.cloud_world.points) <= 500
+    assert len(context.landmarks.ids) <= 50
+    assert len(context.window) <= 5
+
+
+def test_landmarks_are_in_order_and_where_they_are():
+    landmarks = walk(4).context(-1).landmarks
+
+    along = landmarks.ids & ((1 << KEYPOINT_BITS) - 1)
+    assert (np.diff(landmarks.ids) > 0).all()
+    np.testing.assert_allclose(landmarks.positions_world[:, 0], along * 0.01 - 1.0, atol=1e-12)
+
+
+def test_a_landmark_looks_as_the_reference_saw_it():
+    store = walk(4)
+    seen = keyframe(2).observations
+
+    landmarks = store.context(20).landmarks
+
+    at = np.searchsorted(landmarks.ids, seen.landmark_ids)
+    np.testing.assert_array_equal(landmarks.descriptors[at], seen.descriptors)
+    assert (landmarks.octaves[at] == 2).all()
+
+
+def test_landmarks_seen_once_long_ago_are_left_out():
+    lone = landmark_id(0, np.arange(VISIBLE))
+
+    landmarks = walk(6).context(50).landmarks
+
+    assert landmarks.ids.min() > lone[0]  # the first ten centimetres were seen by keyframe 0 only
+
+
+def test_the_window_holds_the_reference_and_something_fixed():
+    window = walk(20).context(-1).window
+
+    assert window[-1].seq == 190 and not window[-1].is_fixed
+    assert sum(k.is_fixed for k in window) >= 1
+    assert [k.seq for k in window] == sorted(k.seq for k in window)
+
+
+def test_the_first_keyframe_is_always_fixed():
+    window = walk(3).context(-1).window
+
+    assert [k.is_fixed for k in window] == [True, False, False]
+
+
+def test_windows_observe_only_landmarks_of_the_context():
+    context = walk(8, ContextConfig(max_landmarks=60)).context(-1)
+
+    seen = np.concatenate([k.observations.landmark_ids for k in context.window])
+    assert set(seen.tolist()) <= set(context.landmarks.ids.tolist())
+
+
+def test_one_revision_and_reference_have_one_context():
+    store = walk(10, noise_m=0.01)
+
+    a, b = store.context(50), store.context(50)
+
+    np.testing.assert_array_equal(a.cloud_world.points, b.cloud_world.points)
+    np.testing.assert_array_equal(a.landmarks.ids, b.landmarks.ids)
+
+
+def test_a_context_of_a_long_walk_is_built_in_time():
+    store = walk(60)
+    store.context(300)
+
+    start = time.process_time()
+    store.context(300)
+
+    assert time.process_time() - start < 0.15  # a third of it on a quiet machine
+
+
+def test_opposite_sides_of_a_thin_wall_are_not_averaged():
+    front = wall_cloud()
+    back = PointCloud(front.points + np.float32([0, 0, 0.005]), -front.normals)
+
+    merged = merge_clouds([front, back], [np.eye(4), np.eye(4)], 0.02)
+
+    np.testing.assert_allclose(np.abs(merged.normals[:, 2]), 1.0)
+
+
+@pytest.mark.parametrize(
+    "change", [{"voxel_size_m": 0.0}, {"max_keyframes": 0}, {"max_landmarks": 0}]
+)
+def test_settings_out_of_range_are_refused(change):
+    with pytest.raises(ConfigError):
+        ContextConfig(**change)
