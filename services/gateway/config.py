@@ -35,7 +35,7 @@ class DispatchConfig:
     """The pool of tracking workers."""
 
     first_frame_timeout_s: float = 20.0  # a worker's first frame of a session fills its caches
-    live_timeout_s: float = 2.0
+    live_timeout_s: float = 6.0  # more than a worker waits for the map's owner
     offline_timeout_s: float = 30.0
     live_wait_s: float = 3.0  # how long a frame waits for a worker to appear
     offline_wait_s: float = 60.0
@@ -58,7 +58,7 @@ class MappingConfig:
     question_timeout_s: float = 30.0
     probe_timeout_s: float = 5.0  # whether an owner that went out of sight is still there
     export_timeout_s: float = 300.0
-    reopen_wait_s: float = 30.0  # how long a session waits for a live mapper
+    reopen_wait_s: float = 60.0  # how long a session waits for a live mapper
     retry_s: float = 0.2
     live_entries: int = 256  # answered frames that a live session holds unacknowledged
     keyframe_wait_s: float = 2.0  # a live session waits so long for a keyframe's acknowledgement

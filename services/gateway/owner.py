@@ -115,9 +115,9 @@ class MapOwner:
         async with self._reopening:
             while self.epoch == epoch:
                 await asyncio.sleep(self._config.retry_s)
-                if await self._is_back():
+                if await self._is_back() or await self._open_anywhere():
                     return
-                if not await self._open_anywhere() and time.monotonic() > deadline:
+                if time.monotonic() > deadline:
                     raise UnavailableError(f"no mapper has session {self.session} at present")
 
     async def _is_back(self) -> bool:

@@ -44,18 +44,39 @@ def other(endpoint):
         yield bus
 
 
+def serve(bus, other, kind, answer, executor=None):
+    """Serve KEY by `other`, and wait until `bus` can reach what it declared."""
+    other.serve(KEY, kind, answer, executor)
+    other.serve(f"{KEY}/settled", Empty, lambda request: request)
+    wait_for(lambda: is_answered(bus, f"{KEY}/settled"))
+
+
+def is_answered(bus, key):
+    try:
+        return bus.query(key, Empty(), Empty, 1.0) == Empty()
+    except GoneError:
+        return False
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 5.0
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert condition()
+
+
 def ask(bus, timeout_s=2.0):
     return bus.query(KEY, DeleteRequest("x"), DeleteRequest, timeout_s)
 
 
 def test_a_query_is_answered(bus, other):
-    other.serve(KEY, DeleteRequest, lambda request: DeleteRequest(request.session + "!"))
+    serve(bus, other, DeleteRequest, lambda request: DeleteRequest(request.session + "!"))
 
     assert ask(bus) == DeleteRequest("x!")
 
 
 def test_an_asynchronous_query_is_answered(bus, other):
-    other.serve(KEY, DeleteRequest, lambda request: request)
+    serve(bus, other, DeleteRequest, lambda request: request)
 
     async def run():
         return await asyncio.gather(
@@ -66,7 +87,7 @@ def test_an_asynchronous_query_is_answered(bus, other):
 
 
 def test_a_reply_may_come_in_pieces(bus, other):
-    other.serve(KEY, DeleteRequest, lambda _: (DeleteRequest(str(i)) for i in range(5)))
+    serve(bus, other, DeleteRequest, lambda _: (DeleteRequest(str(i)) for i in range(5)))
 
     async def run():
         pieces = bus.ask_stream(KEY, DeleteRequest("x"), DeleteRequest, 2.0)
@@ -90,7 +111,7 @@ def test_an_error_arrives_as_its_own_class_with_its_text(bus, other, error):
     def answer(_):
         raise error
 
-    other.serve(KEY, DeleteRequest, answer)
+    serve(bus, other, DeleteRequest, answer)
 
     with pytest.raises(type(error)) as caught:
         ask(bus)
@@ -98,7 +119,7 @@ def test_an_error_arrives_as_its_own_class_with_its_text(bus, other, error):
 
 
 def test_a_fault_of_the_other_side_tells_nothing_of_its_inside(bus, other):
-    other.serve(KEY, DeleteRequest, lambda _: 1 / 0)
+    serve(bus, other, DeleteRequest, lambda _: 1 / 0)
 
     with pytest.raises(PointSlamError, match="internal error") as caught:
         ask(bus)
@@ -106,7 +127,7 @@ def test_a_fault_of_the_other_side_tells_nothing_of_its_inside(bus, other):
 
 
 def test_a_message_of_the_wrong_kind_is_refused_by_field(bus, other):
-    other.serve(KEY, Empty, lambda request: request)
+    serve(bus, other, Empty, lambda request: request)
 
     with pytest.raises(InputError, match="unknown field") as caught:
         ask(bus)
@@ -124,24 +145,26 @@ def test_nobody_there_is_gone_at_once(bus):
 
 def test_one_that_leaves_in_the_middle_is_gone(bus, endpoint):
     other = open_bus([endpoint])
-    asked = threading.Event()
+    asked, finish = threading.Event(), threading.Event()
 
     def answer(request):
         asked.set()
-        time.sleep(0.5)
+        finish.wait(5.0)
         return request
 
-    with ThreadPoolExecutor() as pool:
-        stop = other.serve(KEY, DeleteRequest, answer, pool)
-        stop()
+    with ThreadPoolExecutor(2) as pool:
+        serve(bus, other, DeleteRequest, answer, pool)
+        question = pool.submit(ask, bus, 5.0)
+        asked.wait(5.0)
+        other.close()
 
-    with pytest.raises(GoneError):
-        ask(bus)
-    other.close()
+        with pytest.raises(GoneError):
+            question.result()
+        finish.set()
 
 
 def test_one_that_is_too_slow_times_out(bus, other):
-    other.serve(KEY, DeleteRequest, lambda request: time.sleep(0.6) or request)
+    serve(bus, other, DeleteRequest, lambda request: time.sleep(0.6) or request)
 
     with pytest.raises(TimedOutError):
         ask(bus, timeout_s=0.2)
@@ -155,7 +178,7 @@ def test_an_executor_answers_several_at_a_time(bus, other):
         return request
 
     with ThreadPoolExecutor(2) as pool:
-        other.serve(KEY, DeleteRequest, answer, pool)
+        serve(bus, other, DeleteRequest, answer, pool)
 
         async def run():
             question = bus.ask(KEY, DeleteRequest("x"), DeleteRequest, 5.0)
@@ -166,13 +189,6 @@ def test_an_executor_answers_several_at_a_time(bus, other):
         replies = asyncio.run(run())
 
     assert {reply.session for reply in replies} == {"x", "y"}
-
-
-def wait_for(condition):
-    deadline = time.monotonic() + 5.0
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert condition()
 
 
 def test_publications_reach_who_listens(bus, other):

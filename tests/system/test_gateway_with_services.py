@@ -1,0 +1,195 @@
+"""The gateway with real trackers and a real mapper: the whole way, and processes that die."""
+
+import json
+import os
+import signal
+import time
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+
+from benchmarks import gateway as gateway_benchmark
+from pointslam.client import Client
+from pointslam.datasets import open_sequence
+from pointslam.launcher import LaunchOptions, Services
+from pointslam.synth import Noise, SynthOptions, write_sequence
+from shared.camera import Intrinsics
+from shared.errors import InputError
+from shared.frames import DepthImage, TrackingStatus
+from shared.wire import pose_service_pb2, pose_service_pb2_grpc
+
+pytestmark = pytest.mark.system
+
+ROOM = SynthOptions(
+    num_frames=30,
+    num_views=1,
+    noise=Noise.NONE,
+    camera=Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240),
+)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("synth") / "room"
+    write_sequence(folder, ROOM)
+    return open_sequence(folder)
+
+
+@pytest.fixture(scope="module")
+def services(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("services")
+    with Services(LaunchOptions(folder / "data", folder / "logs")) as services:
+        yield services
+
+
+@pytest.fixture
+def client(services):
+    with Client(services.url) as client:
+        while not client.ready():
+            time.sleep(0.05)
+        yield client
+
+
+@pytest.fixture
+def session(client, room):
+    session = client.create_session(room.calibration, mode="offline", T_map_first=room.truth(0))
+    yield session
+    session.delete()
+
+
+def frames(session, room, first, end):
+    for i in range(first, end):
+        frame = room.frame(i)
+        yield session.frame(frame.rgb, frame.depth, frame.t_ns)
+
+
+def stream(session, room, first, end):
+    return list(session.stream(frames(session, room, first, end)))
+
+
+def errors_m(replies, room):
+    return [
+        float(np.linalg.norm(r.T_map_camera.matrix()[:3, 3] - room.truth(r.seq)[:3, 3]))
+        for r in replies
+    ]
+
+
+def process(services, name):
+    return next(p for p in services.processes if p.command.name == name)
+
+
+def kill_and_restart(services, name):
+    victim = process(services, name)
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.wait(10.0)
+    victim.restart()
+
+
+def wait_for_trackers(services, count):
+    deadline = time.monotonic() + 20.0
+    while httpx.get(f"{services.url}/readyz").json().get("trackers") != count:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_sequence_is_tracked_mapped_and_rendered(session, room):
+    replies = stream(session, room, 0, 15)
+    session.wait_until_mapped()
+
+    view = session.render(room.truth(0))
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+    assert max(errors_m(replies, room)) < 0.01
+    assert session.info()["keyframes"] >= 2
+    assert (view.alpha > 230).mean() > 0.8
+
+
+def test_every_door_tells_the_same_pose(services, session, room):
+    stream(session, room, 0, 3)
+
+    with grpc.insecure_channel(f"127.0.0.1:{services.grpc_port}") as channel:
+        stub = pose_service_pb2_grpc.PoseServiceStub(channel)
+        pose = stub.GetPose(pose_service_pb2.GetPoseRequest(session_id=session.name)).pose
+
+    told = httpx.get(f"{services.url}/v1/sessions/{session.name}/pose").json()
+    assert pose.T_map_camera.position.x == told["T_map_camera"]["position"]["x"]
+    assert pose.T_map_camera.orientation.w == told["T_map_camera"]["orientation"]["w"]
+
+
+def test_a_tracker_killed_in_the_middle_loses_no_frame_and_changes_no_pose(
+    services, client, session, room
+):
+    undisturbed = [r.T_map_camera.matrix() for r in stream(session, room, 0, 12)]
+    again = client.create_session(room.calibration, mode="offline", T_map_first=room.truth(0))
+    replies = stream(again, room, 0, 4)
+    for name in ("tracker-0", "tracker-1"):
+        kill_and_restart(services, name)
+        replies += stream(again, room, len(replies), len(replies) + 4)
+
+    assert [reply.seq for reply in replies] == list(range(12))
+    np.testing.assert_allclose(
+        [reply.T_map_camera.matrix() for reply in replies], undisturbed, atol=1e-9
+    )
+    again.delete()
+
+
+def test_a_frozen_tracker_is_left_for_another(services, session, room):
+    replies = stream(session, room, 0, 2)
+    for name in ("tracker-0", "tracker-1"):  # one of them is the session's
+        frozen = process(services, name).pid
+        os.kill(frozen, signal.SIGSTOP)
+        try:
+            replies += stream(session, room, len(replies), len(replies) + 3)
+        finally:
+            os.kill(frozen, signal.SIGCONT)
+        wait_for_trackers(services, 2)
+
+    assert [reply.seq for reply in replies] == list(range(8))
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+
+
+def test_a_mapper_killed_in_the_middle_keeps_every_answered_frame(services, session, room):
+    stream(session, room, 0, 15)
+    keyframes = session.info()["keyframes"]
+    kill_and_restart(services, "mapper-0")
+
+    replies = stream(session, room, 15, 20)
+
+    assert max(errors_m(replies, room)) < 0.01
+    assert len(session.trajectory()) == 20
+    assert session.info()["keyframes"] >= keyframes
+    assert session.info()["epoch"] == 2
+
+
+def test_a_gateway_killed_in_the_middle_takes_the_session_up_again(services, client, session, room):
+    stream(session, room, 0, 5)
+    kill_and_restart(services, "gateway-0")
+    while not client.ready():
+        time.sleep(0.05)
+
+    resumed = client.session(session.name)
+    replies = stream(resumed, room, 5, 10)
+
+    assert [reply.seq for reply in replies] == [5, 6, 7, 8, 9]
+    assert max(errors_m(replies, room)) < 0.01
+
+
+def test_a_damaged_image_is_refused_by_field_and_the_session_goes_on(session, room):
+    stream(session, room, 0, 2)
+    good = room.frame(2)
+    data = bytearray(good.depth.bytes)
+    data[60 : len(data) - 60] = bytes(len(data) - 120)
+
+    with pytest.raises(InputError) as caught:
+        session.track(good.rgb, DepthImage(good.depth.encoding, bytes(data)), good.t_ns)
+
+    assert caught.value.field == "depth.bytes"
+    assert session.track(good.rgb, good.depth, good.t_ns).status is TrackingStatus.TRACKED
+
+
+def test_the_benchmark_loses_no_reply(capsys):
+    code = gateway_benchmark.main(["--json", "--seconds", "2", "--clients", "2"])
+
+    assert code == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 120
