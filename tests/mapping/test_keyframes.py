@@ -31,8 +31,10 @@ def keyframe(seq: int, landmark_ids: np.ndarray, correction: Correction) -> Keyf
             depths_m=np.full(count, 2.0, np.float32),
             descriptors=rng.integers(0, 256, (count, 32)).astype(np.uint8),
         ),
-        landmark_normals_camera=np.tile(np.float32([0, 0, -1]), (count, 1)),
-        cloud_camera=PointCloud(points, np.tile(np.float32([0, 0, -1]), (len(points), 1))),
+        landmark_normals_camera=np.tile(np.array([0, 0, -1], np.float32), (count, 1)),
+        cloud_camera=PointCloud(
+            points, np.tile(np.array([0, 0, -1], np.float32), (len(points), 1))
+        ),
         thumbnail=rng.integers(0, 256, (15, 20)).astype(np.uint8),
         correction=correction,
     )

@@ -94,7 +94,7 @@ def test_a_separate_depth_camera_is_registered():
 
 @pytest.mark.parametrize("fisheye", [False, True])
 def test_distortion_leaves_the_centre_in_place_and_pulls_the_corners(fisheye):
-    camera = Camera(COLOUR, (0.3, 0.05, 0.0, 0.0), fisheye)
+    camera = Camera(COLOUR, (-0.3, 0.05, 0.0, 0.0), fisheye)
     rgb = np.zeros((48, 64, 3), np.uint8)
     rgb[:, :, 0] = np.arange(64) * 4
 

@@ -84,7 +84,7 @@ def test_landmarks_seen_from_behind_are_not_matched(room):
     features = extract_features(image, CONFIG)
     landmarks = landmarks_of(features, image.intrinsics)
     behind = dataclasses.replace(
-        landmarks, normals_world=np.tile(np.float32([0, 0, 1]), (len(landmarks.ids), 1))
+        landmarks, normals_world=np.tile(np.array([0, 0, 1], np.float32), (len(landmarks.ids), 1))
     )
 
     matches = match_by_projection(features, behind, np.eye(4), image.intrinsics, CONFIG)

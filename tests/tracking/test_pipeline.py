@@ -14,6 +14,11 @@ def path(index: int) -> np.ndarray:
     return exp(index * STEP)
 
 
+def walk(room, session, count: int):
+    """Track the first frames of the path; the last result."""
+    return [session.track(room.frame(i, path(i))) for i in range(count)][-1]
+
+
 def error(T: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
     difference = inverse(T_true) @ T
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(angle_rad(difference)))
@@ -60,8 +65,7 @@ def test_a_first_frame_without_depth_has_no_answer_yet(room, session):
 
 
 def test_a_blind_frame_is_lost_and_repeats_the_pose_before_it(room, session):
-    for i in range(3):
-        before = session.track(room.frame(i, path(i)))
+    before = walk(room, session, 3)
 
     result = session.track(blind(room.frame(3, path(3))))
 
@@ -71,8 +75,7 @@ def test_a_blind_frame_is_lost_and_repeats_the_pose_before_it(room, session):
 
 
 def test_tracking_goes_on_after_blind_frames(room, session):
-    for i in range(3):
-        session.track(room.frame(i, path(i)))
+    walk(room, session, 3)
     for i in range(3, 6):
         session.track(blind(room.frame(i, path(i))))
 
@@ -84,8 +87,7 @@ def test_tracking_goes_on_after_blind_frames(room, session):
 
 def test_a_kidnapped_camera_finds_itself_in_the_map(room, session):
     away = exp([0.2, 0.0, -0.3, 0.0, 1.6, 0.0])
-    for i in range(3):
-        session.track(room.frame(i, path(i)))
+    walk(room, session, 3)
     session.prior = dataclasses.replace(session.prior, T_world_camera=away, lost_frames=5)
 
     result = session.track(room.frame(3, path(4)))
@@ -105,16 +107,14 @@ def test_a_large_step_is_found_by_its_features(room, session):
 
 
 def test_the_pose_is_told_relative_to_its_reference(room, session):
-    for i in range(8):
-        result = session.track(room.frame(i, path(i)))
+    result = walk(room, session, 8)
 
     told = session.store.pose(result.reference_seq) @ result.T_reference_camera
     np.testing.assert_allclose(told, result.T_world_camera, atol=1e-12)
 
 
 def test_the_covariance_is_that_of_a_pose_known_to_millimetres(room, session):
-    for i in range(3):
-        result = session.track(room.frame(i, path(i)))
+    result = walk(room, session, 3)
 
     np.testing.assert_allclose(result.covariance, result.covariance.T, atol=1e-12)
     assert np.linalg.eigvalsh(result.covariance).min() > 0.0
@@ -122,8 +122,7 @@ def test_the_covariance_is_that_of_a_pose_known_to_millimetres(room, session):
 
 
 def test_the_same_request_gives_the_same_bits(room, session):
-    for i in range(4):
-        session.track(room.frame(i, path(i)))
+    walk(room, session, 4)
     frame = room.frame(14, path(12))
 
     first, second = session.answer(frame), session.answer(frame)
@@ -137,8 +136,7 @@ def test_the_same_request_gives_the_same_bits(room, session):
 
 
 def test_every_stage_is_timed(room, session):
-    for i in range(2):
-        result = session.track(room.frame(i, path(i)))
+    result = walk(room, session, 2)
 
     stages = {"decode", "points", "orb", "context", "coarse", "refine", "keyframe", "total"}
     assert stages <= set(result.timings_ms)

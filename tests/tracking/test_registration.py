@@ -20,7 +20,7 @@ def cloud_of(room, T_world_camera):
 def wall(shift_m: float = 0.0) -> PointCloud:
     x, y = np.meshgrid(np.arange(-1.0, 1.0, 0.01), np.arange(-1.0, 1.0, 0.01))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0 + shift_m)], axis=1)
-    normals = np.tile(np.float32([0.0, 0.0, -1.0]), (x.size, 1))
+    normals = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (x.size, 1))
     return PointCloud(points.astype(np.float32), normals)
 
 
