@@ -19,7 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], None] = arguments.command
     try:
         command(arguments)
-    except PointSlamError as error:
+    except (PointSlamError, OSError) as error:  # OSError: the disk, not our logic
         sys.stderr.write(f"error: {error}\n")
         return 2
     except KeyboardInterrupt:

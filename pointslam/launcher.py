@@ -37,7 +37,7 @@ class Services:
     """
 
     def __init__(self, options: LaunchOptions) -> None:
-        ports = _free_ports(3)
+        ports = free_ports(3)
         self.http_port = options.http_port or ports[0]
         self.grpc_port = options.grpc_port or ports[1]
         self.url = f"http://{_HOST}:{self.http_port}"
@@ -118,7 +118,7 @@ class Services:
         ]
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     """Ports that nobody listens on now."""
     sockets = [socket.socket() for _ in range(count)]
     for opened in sockets:

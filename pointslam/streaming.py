@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
 from pointslam.client import FrameOptions, Session
 from pointslam.datasets.base import Sequence, is_held_out
-from pointslam.progress import describe
+from pointslam.progress import describe, open_bar
 from shared.errors import PointSlamError
 from shared.frames import TrackingStatus
 from shared.stream import ErrorDetail, FrameMessage, FrameReply
@@ -65,14 +64,15 @@ def stream_sequence(session: Session, sequence: Sequence, options: StreamOptions
     next_info = start
     replies = []
     frames = _messages(session, sequence, options)
-    with tqdm(total=options.num_frames, desc="frames", unit="frame", dynamic_ncols=True) as bar:
+    with open_bar("frames", "frame", options.num_frames) as bar:
         for reply in session.stream(frames):
             if reply.error is not None:
                 raise _refused(sequence, len(replies), reply.error)
             replies.append(reply)
             bar.update(1)
             if time.monotonic() >= next_info:
-                bar.set_postfix_str(describe(session.info(), str(reply.status)))
+                state = describe(session.info(), str(reply.status))
+                bar.set_postfix_str(state, refresh=False)
                 next_info = time.monotonic() + _INFO_EVERY_S
     return StreamResult(tuple(replies), time.monotonic() - start)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pointslam.launcher import _free_ports
+from pointslam.launcher import free_ports
 from pointslam.process import Command, ServiceProcess
 from shared.errors import UnavailableError
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.system
 
 
 def router(tmp_path: Path, endpoint: str | None = None) -> ServiceProcess:
-    endpoint = endpoint or f"tcp/127.0.0.1:{_free_ports(1)[0]}"
+    endpoint = endpoint or f"tcp/127.0.0.1:{free_ports(1)[0]}"
     return ServiceProcess(
         Command("router", "router", "pointslam.router", ("--listen", endpoint)), tmp_path
     )
@@ -68,7 +68,7 @@ def test_children_die_with_a_parent_that_is_killed(tmp_path):
         "print(process.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    endpoint = f"tcp/127.0.0.1:{_free_ports(1)[0]}"
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     words = [sys.executable, "-c", script, str(tmp_path), endpoint]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
