@@ -28,6 +28,7 @@ class AnchorConfig:
     min_depth_gap_m: float = 0.03  # measured depth this much in front, and by this share,
     min_depth_gap: float = 0.06  # is not covered
     min_samples: int = 2  # depth samples in a voxel that make an anchor
+    fill_holes: bool = True  # seed pixels without depth too, at the depth around them
 
     def __post_init__(self) -> None:
         _check(1 <= self.children <= 10, f"anchors.children must be 1 to 10, got {self.children}")
@@ -117,12 +118,14 @@ class OwnerConfig:
     """The session around the map."""
 
     max_pending: int = 8  # offline: entries not yet worked through, before replies wait
+    max_pending_live: int = 100
     snapshot_interval_s: float = 180.0
     live_idle_s: float = 60.0  # live: optimise for so long after the last entry
     chunk_bytes: int = 4 << 20
 
     def __post_init__(self) -> None:
         _check(self.max_pending > 0, "owner.max_pending must be positive")
+        _check(self.max_pending_live > 0, "owner.max_pending_live must be positive")
         _check(self.chunk_bytes > 0, "owner.chunk_bytes must be positive")
 
 

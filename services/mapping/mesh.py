@@ -15,11 +15,15 @@ from shared.errors import UnavailableError
 from shared.maps import RenderReply, RenderRequest
 
 VOXEL_M = 0.02
-TRUNCATION_M = 0.08
+TRUNCATION_VOXELS = 4.0
+MAX_DEPTH_M = 20.0
 MIN_ALPHA = 200  # of 255: where less is drawn, the depth is of no surface
+MIN_WEIGHT = 0.5  # keyframes that saw a voxel
+_BLOCK_VOXELS = 8  # side of the grid's blocks
+_BLOCKS = 20_000  # room at the start; the grid grows
 _INSTALL = (
     "a mesh needs the package open3d-cpu (pip install 'pointslam[mesh]') and its system "
-    "libraries (apt-get install libgl1 libgomp1 libx11-6)"
+    "libraries (apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1)"
 )
 Visit = Callable[[Callable[[Mapper], Any]], Any]
 
@@ -31,43 +35,53 @@ def export_mesh(visit: Visit) -> bytes:
         visit: asks the mapper between two of its iterations; once for each keyframe here.
 
     Raises:
-        UnavailableError: Open3D or its system libraries are absent; says what to install.
+        UnavailableError: Open3D or its system libraries are absent, or the map has no surface.
     """
     open3d = _open3d()
-    volume = open3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=VOXEL_M,
-        sdf_trunc=TRUNCATION_M,
-        color_type=open3d.pipelines.integration.TSDFVolumeColorType.RGB8,
-    )
+    grid = _grid(open3d)
     for seq in visit(lambda mapper: mapper.views.seqs()):
-        T_world_camera, reply, intrinsics = visit(lambda mapper, seq=seq: _rendered(mapper, seq))
-        k = open3d.camera.PinholeCameraIntrinsic(
-            intrinsics.width, intrinsics.height, intrinsics.matrix()
-        )
-        volume.integrate(_rgbd(open3d, reply), k, se3.inverse(T_world_camera))
-    mesh = volume.extract_triangle_mesh()
+        _integrate(open3d, grid, *visit(lambda mapper, seq=seq: _rendered(mapper, seq)))
+    mesh = grid.extract_triangle_mesh(weight_threshold=MIN_WEIGHT)
+    if len(mesh.vertex.positions) == 0:
+        raise UnavailableError("the map has no surface yet")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
-        open3d.io.write_triangle_mesh(str(path), mesh)
+        open3d.io.write_triangle_mesh(str(path), mesh.to_legacy())
         return path.read_bytes()
 
 
-def _rendered(mapper: Mapper, seq: int) -> tuple[np.ndarray, RenderReply, Any]:
+def _rendered(mapper: Mapper, seq: int) -> tuple[RenderRequest, RenderReply]:
     view = mapper.views[seq]
     intrinsics = mapper.views.image(seq).intrinsics
     request = RenderRequest(view.T_world_camera, intrinsics, view.t_ns)
-    return view.T_world_camera, mapper.render(request), intrinsics
+    return request, mapper.render(request)
 
 
-def _rgbd(open3d: Any, reply: RenderReply) -> Any:
-    depth = np.where(reply.alpha >= MIN_ALPHA, reply.depth_m, 0.0).astype(np.float32)
-    return open3d.geometry.RGBDImage.create_from_color_and_depth(
-        open3d.geometry.Image(np.ascontiguousarray(reply.rgb)),
-        open3d.geometry.Image(depth),
-        depth_scale=1.0,
-        depth_trunc=20.0,
-        convert_rgb_to_intensity=False,
+def _grid(open3d: Any) -> Any:
+    float32 = open3d.core.float32
+    return open3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(float32, float32, float32),
+        attr_channels=((1,), (1,), (3,)),
+        voxel_size=VOXEL_M,
+        block_resolution=_BLOCK_VOXELS,
+        block_count=_BLOCKS,
+        device=open3d.core.Device("CPU:0"),
     )
+
+
+def _integrate(open3d: Any, grid: Any, request: RenderRequest, reply: RenderReply) -> None:
+    """Add one rendered view to the grid."""
+    solid = np.where(reply.alpha >= MIN_ALPHA, reply.depth_m, 0.0).astype(np.float32)
+    if not solid.any():
+        return
+    depth = open3d.t.geometry.Image(solid[..., None])
+    colour = open3d.t.geometry.Image(reply.rgb.astype(np.float32) / np.float32(255.0))
+    matrix = open3d.core.Tensor(request.intrinsics.matrix())
+    T_camera_world = open3d.core.Tensor(se3.inverse(request.T_world_camera))
+    view = matrix, T_camera_world, 1.0, MAX_DEPTH_M, TRUNCATION_VOXELS
+    blocks = grid.compute_unique_block_coordinates(depth, *view)
+    grid.integrate(blocks, depth, colour, *view)
 
 
 def _open3d() -> Any:

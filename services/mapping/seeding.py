@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from services.mapping.anchors import FEATURES, NewAnchors
 from services.mapping.config import AnchorConfig
+from services.mapping.depth_fill import filled_depth
 from services.mapping.voxels import centres, levels_at, sizes_m, voxel_keys
 from shared.rectify import RgbdImage
 from shared.se3 import inverse, transform
@@ -86,10 +87,11 @@ def _landmark_keys(request: SeedRequest, config: AnchorConfig) -> NDArray[np.int
 def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generator) -> _Samples:
     """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
     image, camera = request.image, request.image.intrinsics
-    rows, columns = np.nonzero(image.depth_m > 0.0)
+    depth_m = filled_depth(image.depth_m) if config.fill_holes else image.depth_m
+    rows, columns = np.nonzero(depth_m > 0.0)
     order = rng.permutation(len(rows))
     rows, columns = rows[order], columns[order]
-    depths = image.depth_m[rows, columns]
+    depths = depth_m[rows, columns]
     # A sample stands for its whole pixel, whose centre is at the whole number.
     u = columns + rng.uniform(-0.5, 0.5, len(rows))
     v = rows + rng.uniform(-0.5, 0.5, len(rows))

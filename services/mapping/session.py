@@ -54,7 +54,7 @@ class Session:
         config = surroundings.config
         self.record = folder.take_up()
         self.ledger = Ledger(folder, self.record.epoch, config.keyframes)
-        self._saved_entries = 0
+        self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._worker = MapWorker(mapper, self.record.mode, config)
         self._take_up(mapper)
@@ -69,7 +69,7 @@ class Session:
         resumed = self.ledger.resumed
         if resumed.map is not None:
             mapper.restore(resumed.map, resumed.frames)
-            self._saved_entries = self.ledger.entries - len(resumed.later)
+            self._saved = self.ledger.entries - len(resumed.later), mapper.iterations
         for keyframe in resumed.later:
             self._worker.submit(keyframe)
         self.ledger.forget_resumed()
@@ -151,7 +151,7 @@ class Session:
                 state = self._worker.visit(lambda mapper: mapper.state())
             snapshot = Snapshot(capture.entries, state, capture.keyframes)
             size = write_snapshot(self._folder.path, snapshot)
-            self._saved_entries = capture.entries
+            self._saved = capture.entries, state.values["iterations"]
         return SaveReply(revision, size)
 
     def info(self) -> MapInfo:
@@ -186,8 +186,8 @@ class Session:
         """End the session's threads; with a snapshot unless nothing is new."""
         self._is_closed.set()
         self._saver.join()
-        if is_saved and self.ledger.entries:
-            self._try_to_save()
+        if is_saved:
+            self._save_if_near()
         self._worker.stop()
         self.ledger.close()
         self._folder.close()
@@ -195,10 +195,17 @@ class Session:
     def _save_now_and_then(self) -> None:
         interval_s = self._surroundings.config.owner.snapshot_interval_s
         while not self._is_closed.wait(interval_s):
-            if self.ledger.entries > self._saved_entries:
-                self._try_to_save()
+            self._save_if_near()
 
-    def _try_to_save(self) -> None:
+    def _save_if_near(self) -> None:
+        """Save what is new, unless the map has far to go to the end of the log.
+
+        Then the next start replays the log; waiting would keep new entries out for minutes.
+        """
+        owner = self._surroundings.config.owner
+        is_new = self._saved != (self.ledger.entries, self._worker.iterations)
+        if not is_new or self._worker.pending > 2 * owner.max_pending:
+            return
         try:
             reply = self.save()
             LOGGER.info("%s: snapshot of %d bytes", self.record.session, reply.bytes)

@@ -65,6 +65,11 @@ class MapWorker:
         return self._mapper.stages.medians()
 
     @property
+    def iterations(self) -> int:
+        """Iterations done on the map so far."""
+        return self._mapper.iterations
+
+    @property
     def job(self) -> JobStatus:
         """The present or the last refinement."""
         return self._job
@@ -77,9 +82,10 @@ class MapWorker:
             self._changed.notify_all()
 
     def wait_for_room(self) -> None:
-        """Offline: wait until at most `max_pending` entries are pending."""
-        if not self._is_live:
-            self._wait(lambda: self.pending <= self._config.owner.max_pending)
+        """Wait until at most `max_pending` entries are pending."""
+        owner = self._config.owner
+        limit = owner.max_pending_live if self._is_live else owner.max_pending
+        self._wait(lambda: self.pending <= limit)
 
     def drain(self) -> None:
         """Wait until every entry is worked through."""

@@ -94,7 +94,7 @@ def _keyframe_data(seq: int) -> KeyframeData:
             depths_m=depth[v, u],
             descriptors=rng.integers(0, 256, (LANDMARKS, 32)).astype(np.uint8),
         ),
-        landmark_normals_camera=np.tile(np.float32([0, 0, -1]), (LANDMARKS, 1)),
+        landmark_normals_camera=np.tile(np.array([0, 0, -1], np.float32), (LANDMARKS, 1)),
         cloud_camera=PointCloud(cloud, towards),
         thumbnail=np.zeros((15, 20), np.uint8),
         correction=Correction(

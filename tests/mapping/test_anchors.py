@@ -9,6 +9,7 @@ import torch
 from services.mapping.anchors import AnchorMap, NewAnchors
 from services.mapping.config import AnchorConfig
 from services.mapping.coverage import uncovered
+from services.mapping.depth_fill import filled_depth
 from services.mapping.rows import RowTable
 from services.mapping.seeding import SeedRequest, seed_anchors
 from services.mapping.voxels import centres, level_of, levels_at, sizes_m, voxel_keys
@@ -117,9 +118,9 @@ def test_depth_of_nothing_seeds_nothing():
     ("alpha", "depth_m", "expected"), [(0.2, 0.4, True), (1.0, 2.0, False), (1.0, 2.5, True)]
 )
 def test_a_pixel_is_uncovered_when_open_or_drawn_behind_the_measurement(alpha, depth_m, expected):
-    images = (np.full((1, 1), value, np.float32) for value in (alpha, depth_m, 2.0))
+    a, b, c = (np.full((1, 1), value, np.float32) for value in (alpha, depth_m, 2.0))
 
-    assert uncovered(*images, CONFIG).item() is expected
+    assert uncovered(a, b, c, CONFIG).item() is expected
 
 
 def test_the_cap_keeps_primary_anchors_first():
@@ -161,3 +162,19 @@ def test_children_turn_with_their_anchor():
     anchors.move(0, T_new_old)
 
     np.testing.assert_allclose(children(), se3.transform(T_new_old, before), atol=1e-5)
+
+
+def test_holes_are_filled_from_around_and_measurements_stay():
+    depth = np.full((9, 7), 2.0, np.float32)
+    depth[:, 4:] = 3.0
+    depth[2:6, 1:3] = 0.0
+
+    filled = filled_depth(depth)
+
+    assert (filled[2:6, 1:3] > 1.9).all()
+    assert (filled[2:6, 1:3] < 3.1).all()
+    np.testing.assert_array_equal(filled[depth > 0], depth[depth > 0])
+
+
+def test_an_image_without_depth_stays_empty():
+    assert filled_depth(np.zeros((5, 4), np.float32)).max() == 0.0

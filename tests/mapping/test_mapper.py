@@ -9,6 +9,7 @@ import torch
 from services.mapping import densification
 from services.mapping.config import DensificationConfig, MappingConfig, ScheduleConfig
 from services.mapping.export import bake
+from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
 from shared import se3
 from shared.maps import RenderRequest
@@ -26,7 +27,7 @@ def insert(frame, true_pose):
 
     def run(mapper: Mapper, seq: int, **moved: np.ndarray) -> int:
         seqs = [*mapper.views.seqs(), seq]
-        poses = np.stack([moved.get(f"at_{s}", true_pose(s)) for s in seqs])
+        poses = np.stack([moved[f"at_{s}"] if f"at_{s}" in moved else true_pose(s) for s in seqs])
         keyframe_poses = KeyframePoses(len(seqs), np.array(seqs), poses)
         return mapper.insert_keyframe(NewKeyframe(frame(seq), keyframe_poses, np.zeros((0, 3))))
 
@@ -165,3 +166,16 @@ def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose)
     mapper.iterate(2)
 
     assert added == 0
+
+
+def test_a_mesh_lies_on_the_room(mapper, insert, tmp_path):
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    insert(mapper, 0)
+    mapper.iterate(60)
+
+    (tmp_path / "mesh.ply").write_bytes(export_mesh(lambda question: question(mapper)))
+
+    vertices = np.asarray(open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
+    distances = np.minimum(np.abs(vertices[:, 2] - 2.0), np.abs(vertices[:, 1] - 0.8))
+    assert len(vertices) > 100
+    assert np.median(distances) < 0.02

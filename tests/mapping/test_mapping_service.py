@@ -126,6 +126,7 @@ def test_every_acknowledged_keyframe_survives_kill_9(start, bus, calibration, en
     after = opened(bus)
 
     assert after.epoch == before.epoch + 1
+    assert after.last is not None
     assert after.keyframe_poses.seqs.tolist() == [0, 4, 8]
     assert (after.last.seq, after.map_revision) == (9, 3)
     assert advance(bus, after, entry(10)).map_revision == 3

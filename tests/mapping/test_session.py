@@ -39,11 +39,11 @@ def open_session(tmp_path, record, published):
     )
     opened = []
 
-    def make(name: str = "room") -> Session:
+    def make(name: str = "room", mode: str = "offline") -> Session:
         path = tmp_path / name
         folder = SessionFolder(path)
         if not (path / "session.msgpack").exists():
-            folder.write_record(record)
+            folder.write_record(replace(record, mode=mode))
         opened.append(Session(folder, surroundings))
         return opened[-1]
 
@@ -200,6 +200,16 @@ def test_a_session_can_be_rendered_before_its_first_keyframe(open_session):
     reply = session.render(RenderRequest(np.eye(4), session.record.calibration.colour.intrinsics))
 
     assert reply.rgb.max() == reply.alpha.max() == reply.depth_m.max() == 0
+
+
+def test_a_live_map_is_optimised_while_nothing_comes(open_session, entry):
+    session = open_session(mode="live")
+    session.advance(entry(0))
+
+    while session.info().iterations < 5:
+        os.sched_yield()
+
+    assert session.info().pending == 0
 
 
 def test_a_render_with_a_pose_that_is_no_number_is_refused(open_session):

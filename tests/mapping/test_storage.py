@@ -37,6 +37,7 @@ def test_a_log_gives_back_what_was_appended(written, entry):
 
     assert [e.record.seq for e in entries] == [0, 1, 2, 3, 4]
     assert entries[4].frame == entry(4).frame
+    assert entries[0].keyframe is not None
     np.testing.assert_array_equal(
         entries[0].keyframe.cloud_camera.points, entry(0).keyframe.cloud_camera.points
     )
@@ -91,6 +92,7 @@ def test_the_newest_snapshot_is_read_back(tmp_path):
 
     found = read_newest(tmp_path)
 
+    assert found is not None
     assert found.entries == 3
     assert found.map.values["generator"]["state"] == 2**100 + 3
     assert torch.equal(found.map.tensors["anchors.position"], torch.full((4, 3), 3.0))
@@ -110,7 +112,9 @@ def test_a_damaged_snapshot_is_passed_over_for_the_one_before(tmp_path):
     damaged = tmp_path / "snapshot-000002" / "map.safetensors"
     damaged.write_bytes(damaged.read_bytes()[:-8] + b"damaged!")
 
-    assert read_newest(tmp_path).entries == 1
+    found = read_newest(tmp_path)
+    assert found is not None
+    assert found.entries == 1
 
 
 def test_a_snapshot_that_was_not_finished_does_not_count(tmp_path):
