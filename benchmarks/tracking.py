@@ -124,7 +124,7 @@ def run(folder: Folder, name: str, indices: list[int], config: TrackingConfig) -
     prior: Prior | None = None
     results: list[TrackResult] = []
     for index in indices:
-        result = _track_one(folder, index, prior, store, source, config)
+        result = track(_request(folder, index, prior, store.revision), source, config)
         if result.keyframe is not None:
             store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
         prior = next_prior(prior, result, store)
@@ -133,24 +133,16 @@ def run(folder: Folder, name: str, indices: list[int], config: TrackingConfig) -
     return _row(name, results, truth, store)
 
 
-def _track_one(
-    folder: Folder,
-    index: int,
-    prior: Prior | None,
-    store: KeyframeStore,
-    source: StoreSource,
-    config: TrackingConfig,
-) -> TrackResult:
-    request = TrackRequest(
+def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> TrackRequest:
+    return TrackRequest(
         session="benchmark",
         epoch=1,
-        map_revision=store.revision,
+        map_revision=revision,
         calibration=folder.calibration,
         frame=folder.frame(index),
         prior=prior,
         T_world_first=np.eye(4),
     )
-    return track(request, source, config)
 
 
 def next_prior(prior: Prior | None, result: TrackResult, store: KeyframeStore) -> Prior | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _residuals(view, X, measured, sigmas, camera, y, r):  # pragma: no cover - compiled
+def _residuals(view, X, measured, sigmas, camera, y, r):  # noqa: PLR0913 - compiled
     """Fill the camera point y [3] and the normalised residuals r [3]."""
     for i in range(3):
         y[i] = view[i, 0] * X[0] + view[i, 1] * X[1] + view[i, 2] * X[2] + view[i, 3]
@@ -23,7 +23,7 @@ def _residuals(view, X, measured, sigmas, camera, y, r):  # pragma: no cover - c
 
 
 @numba.njit(cache=True, nogil=True)
-def huber_cost(
+def huber_cost(  # noqa: PLR0913 - compiled
     views, points, camera_index, point_index, measured, sigmas, camera, huber
 ):  # pragma: no cover - compiled
     """Sum of the Huber kernel over pixels and depths."""
@@ -40,7 +40,7 @@ def huber_cost(
 
 
 @numba.njit(cache=True, nogil=True)
-def linearise(
+def linearise(  # noqa: PLR0913 - compiled
     views, points, camera_index, point_index, measured, sigmas, camera, huber
 ):  # pragma: no cover - compiled
     """Blocks of the normal equations: Hcc, Hpp, Hcp (one an observation), bc, bp."""
@@ -92,7 +92,7 @@ def linearise(
 
 
 @numba.njit(cache=True, nogil=True)
-def eliminate_landmarks(
+def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
     Hcc, Hpp, Hcp, bc, bp, camera_index, starts, damping
 ):  # pragma: no cover - compiled
     """Schur complement of the landmarks: the reduced system S, b and the inverses of Hpp."""
@@ -145,7 +145,7 @@ def _invert(H, damping, out):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def back_substitute(inverses, Hcp, bp, camera_index, starts, twists):  # pragma: no cover
+def back_substitute(inverses, Hcp, bp, camera_index, starts, twists):  # noqa: PLR0913 - compiled
     """Moves of the landmarks that belong to the cameras' twists."""
     moves = np.zeros((len(inverses), 3))
     g = np.zeros(3)

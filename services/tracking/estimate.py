@@ -78,32 +78,43 @@ def attempt(
     with clock.stage("coarse"):
         registration = align(observed.cloud, local.voxels, T_start, config.registration)
     with clock.stage("refine"):
-        for _ in range(config.refinement.max_relinearisations):
-            refinement, matches = _refine(observed, local, registration, config)
-            step = inverse(registration.T_world_camera) @ refinement.T_world_camera
-            registration = linearise(
-                observed.cloud,
-                local.voxels.levels[-1],
-                refinement.T_world_camera,
-                config.registration,
-            )
-            if _is_small(step):
-                break
+        still = _refine_until_still(observed, local, registration, config)
         agreement = depth_agreement(
             observed.image,
             local.context.cloud_world,
-            registration.T_world_camera,
+            still.refinement.T_world_camera,
             config.verification,
         )
     return Estimate(
-        T_world_camera=refinement.T_world_camera,
-        information=refinement.information,
-        registration=registration,
+        T_world_camera=still.refinement.T_world_camera,
+        information=still.refinement.information,
+        registration=still.registration,
         agreement=agreement,
-        matches=matches.where(refinement.is_inlier),
-        num_matches=len(matches),
+        matches=still.matches.where(still.refinement.is_inlier),
+        num_matches=len(still.matches),
         local=local,
     )
+
+
+@dataclass(frozen=True)
+class _Refined:
+    refinement: Refinement
+    matches: Matches
+    registration: Registration  # linearised at the refined pose
+
+
+def _refine_until_still(
+    observed: Observed, local: LocalMap, registration: Registration, config: TrackingConfig
+) -> _Refined:
+    """Refine; where that moved the pose, find matches and correspondences anew and repeat."""
+    refined = _refine(observed, local, registration, config)
+    for _ in range(config.refinement.max_relinearisations - 1):
+        step = inverse(registration.T_world_camera) @ refined.refinement.T_world_camera
+        if _is_small(step):
+            break
+        registration = refined.registration
+        refined = _refine(observed, local, registration, config)
+    return refined
 
 
 def _is_small(step: NDArray[np.float64]) -> bool:
@@ -113,10 +124,16 @@ def _is_small(step: NDArray[np.float64]) -> bool:
 
 def _refine(
     observed: Observed, local: LocalMap, registration: Registration, config: TrackingConfig
-) -> tuple[Refinement, Matches]:
+) -> _Refined:
     """Match around a registered pose and minimise both errors together."""
     landmarks = local.context.landmarks
     T, intrinsics = registration.T_world_camera, observed.image.intrinsics
     matches = match_by_projection(observed.features, landmarks, T, intrinsics, config.orb)
     observations = pose_observations(observed.features, landmarks, matches, config.refinement)
-    return refine_pose(observations, registration, T, intrinsics, config.refinement), matches
+    refinement = refine_pose(observations, registration, T, intrinsics, config.refinement)
+    finest = local.voxels.levels[-1]
+    return _Refined(
+        refinement,
+        matches,
+        linearise(observed.cloud, finest, refinement.T_world_camera, config.registration),
+    )

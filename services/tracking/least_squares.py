@@ -80,30 +80,41 @@ def refine_pose(
     camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
     is_inlier = np.ones(len(observations.depths_m), np.bool_)
     for _ in range(config.rounds):
-        T = _minimise(observations, is_inlier, registration, T, camera, config)
+        T = _minimise(_Cost(observations, is_inlier, registration, camera, config), T)
         is_inlier = _chi2(observations, T, camera) < config.outlier_chi2
     H, _, _ = linear_system(observations, is_inlier, T, camera, config)
     return Refinement(T, H + registration.information, is_inlier)
 
 
-def _minimise(
-    observations: PoseObservations,
-    is_used: NDArray[np.bool_],
-    registration: Registration,
-    T: NDArray[np.float64],
-    camera: NDArray[np.float64],
-    config: RefinementConfig,
-) -> NDArray[np.float64]:
-    """Levenberg-Marquardt on the observations in use."""
+@dataclass(frozen=True)
+class _Cost:
+    """The features in use, and the prior."""
+
+    observations: PoseObservations
+    is_used: NDArray[np.bool_]
+    registration: Registration
+    camera: NDArray[np.float64]
+    config: RefinementConfig
+
+    def at(self, T: NDArray[np.float64]) -> tuple[NDArray, NDArray, float]:
+        """Normal equations (H, b) and the cost."""
+        H, b, cost = linear_system(self.observations, self.is_used, T, self.camera, self.config)
+        prior = self.registration
+        step = log_twist(inverse_rigid(prior.T_world_camera) @ T)
+        pull = prior.information @ step
+        cost += float(step @ pull) + 2.0 * float(prior.gradient @ step)
+        return H + prior.information, b + pull + prior.gradient, cost
+
+
+def _minimise(cost_of: _Cost, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Levenberg-Marquardt."""
     damping = 1e-6
-    H, b, cost = _with_prior(observations, is_used, registration, T, camera, config)
-    for _ in range(config.iterations):
+    H, b, cost = cost_of.at(T)
+    for _ in range(cost_of.config.iterations):
         diagonal = np.diag(np.diag(H) * damping + 1e-9)
         twist = -np.linalg.solve(H + diagonal, b)
         T_new = T @ exp_twist(twist)
-        H_new, b_new, cost_new = _with_prior(
-            observations, is_used, registration, T_new, camera, config
-        )
+        H_new, b_new, cost_new = cost_of.at(T_new)
         if cost_new > cost:
             damping *= 10.0
             continue
@@ -111,21 +122,6 @@ def _minimise(
         if np.abs(twist).max() < 1e-6:
             break
     return T
-
-
-def _with_prior(
-    observations: PoseObservations,
-    is_used: NDArray[np.bool_],
-    registration: Registration,
-    T: NDArray[np.float64],
-    camera: NDArray[np.float64],
-    config: RefinementConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    H, b, cost = linear_system(observations, is_used, T, camera, config)
-    step = log_twist(inverse_rigid(registration.T_world_camera) @ T)
-    pull = registration.information @ step
-    cost += float(step @ pull) + 2.0 * float(registration.gradient @ step)
-    return H + registration.information, b + pull + registration.gradient, cost
 
 
 def linear_system(
@@ -167,75 +163,86 @@ def _chi2(
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(
+def _accumulate(  # noqa: PLR0913 - compiled
     points, normals, pixels, sigmas, depths, depth_sigmas, is_used, T, camera, huber
-):  # pragma: no cover - compiled
-    """Normal equations of a camera twist. T maps the world to the camera.
-
-    y = T X moves by -(rho + phi x y). The third residual is the distance of the measured point
-    to the landmark's plane where its normal is known, else the difference in depth.
-    """
+):
+    """Normal equations of a camera twist and the Huber cost. T maps the world to the camera."""
     H = np.zeros((6, 6))
     b = np.zeros(6)
     J = np.zeros((3, 6))
     r = np.zeros(3)
-    g = np.zeros((3, 3))
-    lever = np.zeros((3, 3))
+    y = np.zeros(3)
     cost = 0.0
     for n in range(len(points)):
         if not is_used[n]:
             continue
-        X = points[n]
-        x = T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]
-        y = T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]
-        z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
-        if z < 0.05:
+        for i in range(3):
+            y[i] = T[i, 3]
+            for j in range(3):
+                y[i] += T[i, j] * points[n, j]
+        if y[2] < 0.05:
             continue
-        g[:] = 0.0
-        lever[:, 0], lever[:, 1], lever[:, 2] = x, y, z
-        g[0, 0] = camera[0] / z / sigmas[n]
-        g[0, 2] = -camera[0] * x / (z * z) / sigmas[n]
-        g[1, 1] = camera[1] / z / sigmas[n]
-        g[1, 2] = -camera[1] * y / (z * z) / sigmas[n]
-        r[0] = (camera[0] * x / z + camera[2] - pixels[n, 0]) / sigmas[n]
-        r[1] = (camera[1] * y / z + camera[3] - pixels[n, 1]) / sigmas[n]
-        r[2] = 0.0
-        d = depths[n]
-        if d > 0.0:
-            w = normals[n]
-            mx = T[0, 0] * w[0] + T[0, 1] * w[1] + T[0, 2] * w[2]
-            my = T[1, 0] * w[0] + T[1, 1] * w[1] + T[1, 2] * w[2]
-            mz = T[2, 0] * w[0] + T[2, 1] * w[1] + T[2, 2] * w[2]
-            has_normal = mx * mx + my * my + mz * mz > 0.5
-            if not has_normal:
-                mx, my, mz = 0.0, 0.0, 1.0
-            ex = x - (pixels[n, 0] - camera[2]) / camera[0] * d
-            ey = y - (pixels[n, 1] - camera[3]) / camera[1] * d
-            r[2] = (mx * ex + my * ey + mz * (z - d)) / depth_sigmas[n]
-            if has_normal:  # the measured point turns, not the landmark
-                lever[2, 0], lever[2, 1], lever[2, 2] = x - ex, y - ey, d
-            g[2, 0] = mx / depth_sigmas[n]
-            g[2, 1] = my / depth_sigmas[n]
-            g[2, 2] = mz / depth_sigmas[n]
-        for k in range(3):
-            gx, gy, gz = g[k, 0], g[k, 1], g[k, 2]
-            J[k, 0], J[k, 1], J[k, 2] = -gx, -gy, -gz
-            J[k, 3] = gy * lever[k, 2] - gz * lever[k, 1]
-            J[k, 4] = gz * lever[k, 0] - gx * lever[k, 2]
-            J[k, 5] = gx * lever[k, 1] - gy * lever[k, 0]
+        _reprojection_rows(y, pixels[n], sigmas[n], camera, r, J)
+        _plane_row(y, T[:3, :3] @ normals[n], pixels[n], depths[n], camera, r, J)
+        r[2] /= depth_sigmas[n]
+        J[2] /= depth_sigmas[n]
         error = np.sqrt(r[0] * r[0] + r[1] * r[1])
-        weight = 1.0 if error <= huber else huber / error
-        cost += error * error if error <= huber else 2.0 * huber * error - huber * huber
         plane = abs(r[2])
+        weight = 1.0 if error <= huber else huber / error
         weight_plane = 1.0 if plane <= huber else huber / plane
-        cost += plane * plane if plane <= huber else 2.0 * huber * plane - huber * huber
+        cost += error * error if error <= huber else huber * (2.0 * error - huber)
+        cost += plane * plane if plane <= huber else huber * (2.0 * plane - huber)
         for k in range(3):
             s = weight if k < 2 else weight_plane
             for i in range(6):
                 b[i] += s * J[k, i] * r[k]
-                for j in range(i, 6):
+                for j in range(6):
                     H[i, j] += s * J[k, i] * J[k, j]
-    for i in range(6):
-        for j in range(i):
-            H[i, j] = H[j, i]
     return H, b, cost
+
+
+@numba.njit(cache=True, nogil=True)
+def _reprojection_rows(y, pixel, sigma, camera, r, J):  # noqa: PLR0913 - compiled
+    """Rows 0 and 1: y = T X moves by -(rho + phi x y)."""
+    z = y[2]
+    for k in range(2):
+        r[k] = (camera[k] * y[k] / z + camera[2 + k] - pixel[k]) / sigma
+    a, b = camera[0] / z / sigma, camera[1] / z / sigma
+    _row(a, 0.0, -a * y[0] / z, y, J[0])
+    _row(0.0, b, -b * y[1] / z, y, J[1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _plane_row(y, normal, pixel, depth, camera, r, J):  # noqa: PLR0913 - compiled
+    """Row 2, metres: the measured point's distance from the landmark's plane.
+
+    Where no normal is known it is the difference in depth; without depth it is nothing.
+    """
+    r[2] = 0.0
+    J[2] = 0.0
+    if depth <= 0.0:
+        return
+    measured = np.array(
+        [
+            (pixel[0] - camera[2]) / camera[0] * depth,
+            (pixel[1] - camera[3]) / camera[1] * depth,
+            depth,
+        ]
+    )
+    if normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2 < 0.5:
+        r[2] = y[2] - depth
+        _row(0.0, 0.0, 1.0, y, J[2])
+        return
+    for i in range(3):
+        r[2] += normal[i] * (y[i] - measured[i])
+    # The plane stands still in the world: it is the measured point that turns with the camera.
+    _row(normal[0], normal[1], normal[2], measured, J[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def _row(gx, gy, gz, lever, out):  # pragma: no cover - compiled
+    """Derivative by a camera twist of g . y, where y moves by -(rho + phi x lever)."""
+    out[0], out[1], out[2] = -gx, -gy, -gz
+    out[3] = gy * lever[2] - gz * lever[1]
+    out[4] = gz * lever[0] - gx * lever[2]
+    out[5] = gx * lever[1] - gy * lever[0]

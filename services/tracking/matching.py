@@ -112,7 +112,7 @@ def _one_to_one(
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(
+def _search(  # noqa: C901, PLR0913 - compiled
     positions,
     normals,
     words,

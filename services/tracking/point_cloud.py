@@ -99,7 +99,7 @@ def _fit_planes_at(depth, pixels, camera, radius, limits):  # pragma: no cover -
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_plane(depth, u, v, camera, radius, limits):  # pragma: no cover - compiled
+def _fit_plane(depth, u, v, camera, radius, limits):  # noqa: PLR0913 - compiled
     """Inverse depth (0: no plane) and unit normal at a pixel."""
     height, width = depth.shape
     fx, fy = camera[0], camera[1]

@@ -49,21 +49,23 @@ def align(
     T = T_world_camera
     levels = zip(target.levels, config.sample_steps, config.max_iterations, strict=True)
     for level, step, iterations in levels:
-        points, normals = source.points[::step], source.normals[::step]
-        T = _align_level(points, normals, level, T, iterations, config)
+        T = _align_level(_every(source, step), level, T, iterations, config)
     return linearise(source, target.levels[-1], orthonormalise(T), config)
 
 
+def _every(cloud: PointCloud, step: int) -> PointCloud:
+    return PointCloud(cloud.points[::step], cloud.normals[::step])
+
+
 def _align_level(
-    points: NDArray[np.float32],
-    normals: NDArray[np.float32],
+    source: PointCloud,
     level: VoxelLevel,
     T: NDArray[np.float64],
     iterations: int,
     config: RegistrationConfig,
 ) -> NDArray[np.float64]:
     for _ in range(iterations):
-        H, b, _, _ = _normal_equations(points, normals, level, T, config)
+        H, b, _, _ = _normal_equations(source, level, T, config)
         twist = _well_determined_step(H, b, config.min_eigenvalue_share)
         T = T @ exp_twist(twist)
         if (
@@ -79,8 +81,7 @@ def linearise(
 ) -> Registration:
     """The registration's cost around a pose, without a step."""
     step = config.sample_steps[-1]
-    points, normals = source.points[::step], source.normals[::step]
-    H, b, overlap, scale = _normal_equations(points, normals, level, T, config)
+    H, b, overlap, scale = _normal_equations(_every(source, step), level, T, config)
     sigma = max(scale, config.model_sigma)
     factor = step * config.effective_share / sigma**2
     return Registration(T, factor * H, factor * b, overlap, scale)
@@ -95,16 +96,12 @@ def optimum(registration: Registration, config: RegistrationConfig) -> NDArray[n
 
 
 def _normal_equations(
-    points: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    level: VoxelLevel,
-    T: NDArray[np.float64],
-    config: RegistrationConfig,
+    source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
     """Hessian, gradient (in depth sigmas), overlap and residual scale at a pose."""
     residuals, directions = _correspond(
-        points,
-        normals,
+        source.points,
+        source.normals,
         T,
         level.voxel_size_m,
         level.keys,
@@ -118,8 +115,8 @@ def _normal_equations(
         return np.zeros((6, 6)), np.zeros(6), 0.0, 1.0
     scale = 1.4826 * float(np.median(np.abs(residuals[found])))
     width = max(config.kernel_width * scale, config.min_kernel_width)
-    H, b = _accumulate(points, directions, residuals, found, width)
-    return H, b, len(found) / len(points), scale
+    H, b = _accumulate(source.points, directions, residuals, found, width)
+    return H, b, len(found) / len(source.points), scale
 
 
 def _well_determined_step(
@@ -135,7 +132,7 @@ def _well_determined_step(
 
 
 @numba.njit(cache=True, nogil=True)
-def _correspond(
+def _correspond(  # noqa: C901, PLR0913 - compiled
     points, normals, T, size, keys, rows, map_points, map_normals, limits
 ):  # pragma: no cover - compiled
     """Residual along the map's normal in depth sigmas (NaN: none) and J's first half, scaled."""

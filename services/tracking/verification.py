@@ -55,7 +55,7 @@ def is_possible_step(
 
 
 @numba.njit(cache=True, nogil=True)
-def _compare(depth, points, normals, T, camera, tolerance):  # pragma: no cover - compiled
+def _compare(depth, points, normals, T, camera, tolerance):  # noqa: PLR0913 - compiled
     height, width = depth.shape
     on = front = behind = 0
     for n in range(len(points)):

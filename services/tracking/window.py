@@ -60,7 +60,18 @@ def adjust_window(
     window = (*context.window, _as_window(keyframe))
     observed = _observed(window, context.landmarks, config)
     seen = np.unique(observed.point_index)
-    problem = _problem(window, observed, seen, context, keyframe.registration, intrinsics, config)
+    held = _held_by_geometry(keyframe, window, context, intrinsics, config)
+    problem = BundleProblem(
+        T_world_cameras=np.stack([member.T_world_camera for member in window]),
+        is_fixed=np.array([member.is_fixed for member in window]),
+        T_world_priors=held.T_world_cameras,
+        pose_information=held.information,
+        points_world=context.landmarks.positions_world[seen],
+        camera_index=observed.camera_index,
+        point_index=np.searchsorted(seen, observed.point_index),
+        measured=observed.measured,
+        sigmas=observed.sigmas,
+    )
     solution = solve_bundle(problem, intrinsics, config.bundle_adjustment)
     return _correction(window, problem, solution, context.landmarks.ids[seen], intrinsics)
 
@@ -122,31 +133,29 @@ def _camera_rows(
     return cameras, at[rows], measured, np.column_stack([pixel_sigmas, depth_sigmas])
 
 
-def _problem(
+@dataclass(frozen=True)
+class _Held:
+    """Where geometry holds the cameras of a window, and how firmly."""
+
+    T_world_cameras: NDArray[np.float64]  # [K, 4, 4]
+    information: NDArray[np.float64]  # [K, 6, 6]
+
+
+def _held_by_geometry(
+    keyframe: NewKeyframe,
     window: tuple[WindowKeyframe, ...],
-    observed: _Observed,
-    seen: NDArray[np.int64],
     context: TrackingContext,
-    registration: Registration,
     intrinsics: Intrinsics,
     config: TrackingConfig,
-) -> BundleProblem:
-    poses = np.stack([keyframe.T_world_camera for keyframe in window])
-    priors = poses.copy()
-    priors[-1] = optimum(registration, config.registration)
-    information = pose_information(context.cloud_world, poses, registration, intrinsics, config)
-    information[-1] = registration.information
-    return BundleProblem(
-        T_world_cameras=poses,
-        is_fixed=np.array([keyframe.is_fixed for keyframe in window]),
-        T_world_priors=priors,
-        pose_information=config.bundle_adjustment.pose_prior_share * information,
-        points_world=context.landmarks.positions_world[seen],
-        camera_index=observed.camera_index,
-        point_index=np.searchsorted(seen, observed.point_index),
-        measured=observed.measured,
-        sigmas=observed.sigmas,
+) -> _Held:
+    """The new keyframe where it registers best, the others where they are."""
+    poses = np.stack([member.T_world_camera for member in window])
+    information = pose_information(
+        context.cloud_world, poses, keyframe.registration, intrinsics, config
     )
+    poses[-1] = optimum(keyframe.registration, config.registration)
+    information[-1] = keyframe.registration.information
+    return _Held(poses, config.bundle_adjustment.pose_prior_share * information)
 
 
 def pose_information(
