@@ -219,7 +219,7 @@ class StandInMapper:
             landmarks=0,
             primary_anchors=0,
             secondary_anchors=0,
-            iterations=0,
+            iterations=known.refinement.iterations_done,
             pending=0,
             psnr_db=None,
             refinement=known.refinement,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -12,6 +13,8 @@ from services.gateway.errors import OrderError
 from shared.errors import PointSlamError, UnavailableError
 from shared.frames import TrackingStatus
 from shared.stream import FrameMessage, FrameReply
+
+LOGGER = logging.getLogger(__name__)
 
 Outcome = FrameReply | PointSlamError
 
@@ -109,6 +112,10 @@ class FrameQueue:
         except PointSlamError as error:
             # A refused frame does not count: its number may come again with good content.
             return error
+        except Exception:
+            # A fault of ours must not leave the sender waiting or end the session.
+            LOGGER.exception("frame %d: the answer failed", current.message.seq)
+            return PointSlamError("internal error; see the gateway's log")
         self._answered = (current.message.seq, current.message.t_ns)
         return reply
 

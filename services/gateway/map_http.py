@@ -13,7 +13,7 @@ from starlette.responses import Response, StreamingResponse
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
 from services.gateway.decode import plain
-from services.gateway.map_queries import ask_render, export_pieces
+from services.gateway.map_queries import ask_render, export_pieces, map_state
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, pose_from
@@ -94,13 +94,13 @@ def _add_render_route(router: APIRouter, sessions: Sessions) -> None:
         session = await sessions.get(name)
         view = _view(session, pose, camera, wanted)
         view.check(config.limits.max_render_pixels)
-        known = request.headers.get("if-none-match", "")
-        if view.etag(session.owner.revision) in known:
-            return Response(status_code=304, headers={"ETag": view.etag(session.owner.revision)})
+        etag = view.etag(await map_state(session, config))
+        if etag in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers={"ETag": etag})
         reply = await ask_render(session, view.request, config)
         # Encoding takes 10 ms and more; frames go on meanwhile.
         content = await asyncio.to_thread(view.encode, reply)
-        headers = {"ETag": view.etag(reply.revision), "Cache-Control": "no-cache"}
+        headers = {"ETag": etag, "Cache-Control": "no-cache"}
         return Response(content, 200, headers, MEDIA_TYPES[view.format])
 
 

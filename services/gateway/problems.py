@@ -42,6 +42,10 @@ def add_handlers(app: FastAPI) -> None:
         document = problem(error.status_code, ErrorDetail(code, "", str(error.detail)))
         return JSONResponse(document, error.status_code, error.headers, MEDIA_TYPE)
 
+    @app.exception_handler(Exception)
+    async def _fault(_: Request, __: Exception) -> Response:
+        return problem_response(PointSlamError("internal error; see the gateway's log"))
+
     @app.exception_handler(ClientDisconnect)
     async def _gone(_: Request, __: ClientDisconnect) -> Response:
         return Response(status_code=499)  # nobody reads it

@@ -41,10 +41,10 @@ class View:
         if self.what == "depth" and self.format == "jpeg":
             raise InputError("format", "depth comes as png or msgpack")
 
-    def etag(self, revision: int) -> str:
-        """A strong entity tag: the map's revision and this view."""
+    def etag(self, state: str) -> str:
+        """A strong entity tag: the map's state and this view."""
         content = codec.pack(self.request) + f"{self.what} {self.format}".encode()
-        return f'"{revision}-{hashlib.blake2b(content, digest_size=12).hexdigest()}"'
+        return f'"{state}-{hashlib.blake2b(content, digest_size=12).hexdigest()}"'
 
     def encode(self, reply: RenderReply) -> bytes:
         """The file."""

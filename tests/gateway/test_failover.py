@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from benchmarks.local_gateway import free_port, gateway_process, local_gateway
 from benchmarks.stand_ins import StandInMapper, StandInTracker
 from pointslam.client import Client
-from shared.bus import open_bus
+from shared.bus import open_bus, open_router
 from shared.errors import UnavailableError
 from shared.frames import TrackingStatus
 
@@ -172,3 +173,31 @@ def test_a_live_session_holds_its_frames_while_the_map_has_no_owner(
         StandInMapper(bus, "mapper-1", disk)
         session.wait_until_mapped()
         assert [e.record.seq for e in disk[session.name].entries] == [0, 1, 2, 3]
+
+
+def test_a_router_that_starts_again_brings_everything_back(calibration, rgb, depth):
+    port = free_port()
+    router = open_router(f"tcp/127.0.0.1:{port}")
+    endpoint, ports = f"tcp/127.0.0.1:{port}", (free_port(), free_port())
+    with ExitStack() as stack:
+        StandInTracker(stack.enter_context(open_bus([endpoint])), "tracker-0")
+        StandInMapper(stack.enter_context(open_bus([endpoint])), "mapper-0")
+        stack.enter_context(gateway_process(endpoint, ports))
+        client = stack.enter_context(Client(f"http://127.0.0.1:{ports[0]}"))
+        wait_for(client.ready)
+        session = client.create_session(calibration, mode="offline")
+        session.track(rgb, depth, SECOND)
+
+        router.close()
+        wait_for(lambda: not client.ready())
+        stack.callback(open_router(endpoint).close)
+
+        assert session.track(rgb, depth, 2 * SECOND).status is TrackingStatus.TRACKED
+        assert session.info()["epoch"] == 1
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

@@ -6,7 +6,7 @@ import pytest
 
 from services.gateway.errors import OrderError
 from services.gateway.frame_queue import FrameQueue
-from shared.errors import InputError, UnavailableError
+from shared.errors import InputError, PointSlamError, UnavailableError
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
 from shared.stream import DepthMessage, FrameMessage, FrameReply
 
@@ -113,6 +113,21 @@ def test_the_number_of_a_refused_frame_may_come_again():
     assert isinstance(refused, InputError)
     assert isinstance(again, FrameReply)
     assert again.status is TrackingStatus.TRACKED
+
+
+def test_a_fault_of_ours_is_told_and_the_next_frame_is_answered():
+    async def answer(frame, _):
+        if frame.seq == 0:
+            raise ZeroDivisionError
+        return FrameReply(frame.seq, frame.t_ns, TrackingStatus.TRACKED)
+
+    async def run():
+        return await submit_all(offline(answer), 0, 1)
+
+    fault, good = asyncio.run(run())
+
+    assert type(fault) is PointSlamError
+    assert isinstance(good, FrameReply)
 
 
 def test_too_many_waiting_frames_are_refused():

@@ -185,6 +185,15 @@ def test_a_changed_map_or_view_has_another_etag(gateway, tracked, rgb, depth):
     assert len({etag, other_view, other_map}) == 3
 
 
+def test_an_optimised_map_has_another_etag(gateway, tracked):
+    etag = httpx.get(url(gateway, tracked, "/render")).headers["etag"]
+    tracked.refine(50)
+
+    again = httpx.get(url(gateway, tracked, "/render"), headers={"If-None-Match": etag})
+
+    assert again.status_code == 200
+
+
 def test_a_view_has_the_size_that_is_asked_for(tracked, calibration):
     view = tracked.render(inverse(np.eye(4)), calibration.colour.intrinsics.scaled(0.5))
 
