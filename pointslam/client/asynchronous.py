@@ -16,12 +16,12 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from pointslam.client import calls
 from pointslam.client.frame_stream import refusal
 from pointslam.client.messages import FrameOptions, frame_message
-from pointslam.client.progress import POLL_S, pending, refinement
+from pointslam.client.progress import POLL_S, Progress, pending, refinement
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import UnavailableError
 from shared.frames import ColourImage, DepthImage
-from shared.maps import RenderReply
+from shared.maps import ExportFormat, RenderReply
 from shared.stream import FrameMessage, FrameReply
 
 T = TypeVar("T")
@@ -77,9 +77,30 @@ class AsyncClient:
         try:
             response = await self._http.request(call.method, call.path, **call.arguments())
         except httpx.TransportError as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise UnavailableError(f"{self.url} does not answer ({reason})") from None
+            raise self._unreachable(error) from None
         return call.answer(response)
+
+    async def download(self, path: str, params: dict[str, str]) -> AsyncIterator[bytes]:
+        """A file piece by piece.
+
+        Raises:
+            PointSlamError: the gateway refused, or broke off.
+        """
+        try:
+            async with self._http.stream(
+                "GET", path, params=params, timeout=calls.SLOW_S
+            ) as response:
+                if not response.is_success:
+                    await response.aread()
+                    raise calls.error_from(calls.problem_of(response))
+                async for piece in response.aiter_bytes():
+                    yield piece
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from None
+
+    def _unreachable(self, error: Exception) -> UnavailableError:
+        reason = f"{type(error).__name__}: {error}"
+        return UnavailableError(f"{self.url} does not answer ({reason})")
 
 
 class AsyncSession:
@@ -161,16 +182,26 @@ class AsyncSession:
         """State of the map (fields of MapInfo) and of tracking."""
         return await self._client.call(calls.info(self.name))
 
-    async def refine(self, iterations: int) -> None:
+    async def refine(self, iterations: int, progress: Progress | None = None) -> None:
         """Optimise the map on all keyframes; returns when done."""
         await self._client.call(calls.refine(self.name, iterations))
-        while refinement(await self.info())[0]:
+        is_running = True
+        while is_running:
             await asyncio.sleep(POLL_S)
+            is_running, done, total = refinement(await self.info())
+            if progress is not None:
+                progress(done, total)
 
     async def wait_until_mapped(self) -> None:
         """Wait until the map has worked through every answered frame."""
         while pending(await self.info()) > 0:
             await asyncio.sleep(POLL_S)
+
+    async def export(self, format: ExportFormat | str) -> AsyncIterator[bytes]:
+        """The map as a file (ply, mesh or snapshot), piece by piece."""
+        params = {"format": str(ExportFormat(format))}
+        async for piece in self._client.download(calls.export_path(self.name), params):
+            yield piece
 
     async def save(self) -> dict[str, Any]:
         """Write a snapshot; returns when it is on disk."""

@@ -34,7 +34,7 @@ _SUFFIXES = {ExportFormat.PLY: "ply", ExportFormat.MESH: "mesh.ply", ExportForma
 
 @dataclass(frozen=True)
 class PoseQuery:
-    """Camera to map: position in metres, quaternion."""
+    """Camera to map: position in metres, quaternion; or both as JSON, as `pose` tells them."""
 
     px: float = 0.0
     py: float = 0.0
@@ -43,6 +43,7 @@ class PoseQuery:
     qy: float = 0.0
     qz: float = 0.0
     qw: float = 1.0
+    T_map_camera: str | None = None
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def _view(session: Session, pose: PoseQuery, camera: CameraQuery, wanted: ViewQu
     colour = session.calibration.colour.intrinsics
     return View(
         request=RenderRequest(
-            T_world_camera=pose_from(vars(pose)),
+            T_world_camera=pose_from(pose.T_map_camera, vars(pose)),
             intrinsics=intrinsics_from(lens, camera.width, camera.height, colour),
             appearance_t_ns=wanted.appearance_t_ns,
         ),

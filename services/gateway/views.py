@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.gateway.decode import plain
 from shared import codec, images
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -61,12 +63,17 @@ def _millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.clip(np.rint(depth_m * DEPTH_SCALE), 0, 65534).astype(np.uint16)
 
 
-def pose_from(values: dict[str, float]) -> NDArray[np.float64]:
-    """T_map_camera from px, py, pz, qx, qy, qz, qw.
+def pose_from(spelled: str | None, values: dict[str, float]) -> NDArray[np.float64]:
+    """T_map_camera from JSON with named fields, else from px, py, pz, qx, qy, qz, qw.
 
     Raises:
-        InputError: a value is not finite, or the quaternion has no length.
+        InputError: no such JSON, a value is not finite, or the quaternion has no length.
     """
+    if spelled is not None:
+        try:
+            return plain(Pose, json.loads(spelled)).matrix()
+        except (ValueError, RecursionError) as error:
+            raise InputError("T_map_camera", f"not JSON ({str(error)[:100]})") from None
     position = Vector3(values["px"], values["py"], values["pz"])
     orientation = Quaternion(values["qx"], values["qy"], values["qz"], values["qw"])
     return Pose(position, orientation).matrix()

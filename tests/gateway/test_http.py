@@ -1,5 +1,7 @@
 """Sessions, frames, poses and maps over HTTP, against a real gateway process."""
 
+import json
+
 import cv2
 import httpx
 import numpy as np
@@ -164,6 +166,17 @@ def test_a_rendered_view_is_a_jpeg_of_the_sessions_camera(gateway, tracked, cali
     assert images.decode_colour(image, calibration.colour.intrinsics).shape == (48, 64, 3)
 
 
+def test_a_pose_that_was_told_can_be_asked_back_as_a_view(gateway, tracked):
+    told = httpx.get(url(gateway, tracked, "/pose")).json()["T_map_camera"]
+    p, q = told["position"], told["orientation"]
+    components = {f"p{k}": v for k, v in p.items()} | {f"q{k}": v for k, v in q.items()}
+
+    whole = httpx.get(url(gateway, tracked, "/render"), params={"T_map_camera": json.dumps(told)})
+    spelled = httpx.get(url(gateway, tracked, "/render"), params=components)
+
+    assert whole.headers["etag"] == spelled.headers["etag"]
+
+
 def test_a_view_of_an_unchanged_map_is_not_sent_again(gateway, tracked):
     first = httpx.get(url(gateway, tracked, "/render"))
 
@@ -224,6 +237,8 @@ def test_depth_comes_as_millimetres_in_a_png(gateway, tracked):
         ("qw=0", "orientation"),
         ("px=inf", "position"),
         ("width=many", "width"),
+        ("T_map_camera={", "T_map_camera"),
+        ('T_map_camera={"position": 1, "orientation": 1}', "position"),
     ],
 )
 def test_a_view_that_cannot_be_is_refused_by_field(gateway, tracked, query, field):

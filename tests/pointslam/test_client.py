@@ -183,16 +183,18 @@ async def use_async(url):
         poses = await session.poses()
         await session.refine(10)
         await session.wait_until_mapped()
+        size = sum([len(piece) async for piece in session.export("ply")])
         await session.delete()
-        return [first, *rest], poses, view
+        return [first, *rest], poses, view, size
 
 
 def test_the_asynchronous_client_does_the_same(gateway):
-    replies, poses, view = asyncio.run(use_async(gateway.url))
+    replies, poses, view, size = asyncio.run(use_async(gateway.url))
 
     assert [reply.seq for reply in replies] == list(range(11))
     assert [t for t, _ in poses] == [(i + 1) * SECOND for i in range(11)]
     assert view.rgb.shape == (48, 64, 3)
+    assert size == 3000
 
 
 async def stream_to_nobody(url):
