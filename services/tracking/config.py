@@ -37,7 +37,7 @@ class RegistrationConfig:
 
     voxel_sizes_m: tuple[float, ...] = (0.20, 0.10, 0.05)
     sample_steps: tuple[int, ...] = (8, 4, 2)
-    max_iterations: tuple[int, ...] = (8, 8, 12)
+    max_iterations: tuple[int, ...] = (8, 8, 8)
     min_normal_cos: float = 0.7
     depth_sigma_floor_m: float = 0.002
     depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
@@ -85,7 +85,7 @@ class RefinementConfig:
     depth_sigma_floor_m: float = 0.005
     depth_sigma_per_m2: float = 0.004
     huber_sigma: float = 2.0
-    rounds: int = 3
+    rounds: int = 2
     iterations: int = 5
     outlier_chi2: float = 9.0
     max_relinearisations: int = 4  # of matches and registration around the refined pose

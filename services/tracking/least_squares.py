@@ -19,7 +19,7 @@ from services.tracking.orb import Features
 from services.tracking.registration import Registration
 from services.tracking.twists import exp_twist, inverse_rigid, log_twist
 from shared.camera import Intrinsics
-from shared.se3 import inverse
+from shared.se3 import inverse, rotate, transform
 from shared.tracks import Landmarks
 
 
@@ -133,15 +133,15 @@ def linear_system(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Normal equations (H, b) of a camera twist and the cost, whose gradient is 2 b."""
     o = observations
+    T_camera_world = inverse_rigid(T)
     return _accumulate(
-        o.points_world,
-        o.normals_world,
+        transform(T_camera_world, o.points_world),
+        rotate(T_camera_world, o.normals_world),
         o.keypoints_px,
         o.pixel_sigmas,
         o.depths_m,
         o.depth_sigmas_m,
         is_used,
-        inverse_rigid(T),
         camera,
         config.huber_sigma,
     )
@@ -151,8 +151,7 @@ def _chi2(
     observations: PoseObservations, T: NDArray[np.float64], camera: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Squared normalised error of each observation; infinite behind the camera."""
-    T_camera_world = inverse(T)
-    points = observations.points_world @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    points = transform(inverse(T), observations.points_world)
     z = np.maximum(points[:, 2], 1e-3)
     projected = camera[:2] * points[:, :2] / z[:, None] + camera[2:]
     pixels = (projected - observations.keypoints_px) / observations.pixel_sigmas[:, None]
@@ -164,28 +163,23 @@ def _chi2(
 
 @numba.njit(cache=True, nogil=True)
 def _accumulate(  # noqa: PLR0913 - compiled
-    points, normals, pixels, sigmas, depths, depth_sigmas, is_used, T, camera, huber
+    points, normals, pixels, sigmas, depths, depth_sigmas, is_used, camera, huber
 ):
-    """Normal equations of a camera twist and the Huber cost. T maps the world to the camera."""
+    """Normal equations of a camera twist and the Huber cost; points and normals of the camera."""
     H = np.zeros((6, 6))
     b = np.zeros(6)
     J = np.zeros((3, 6))
     r = np.zeros(3)
-    y = np.zeros(3)
     cost = 0.0
     for n in range(len(points)):
-        if not is_used[n]:
-            continue
-        for i in range(3):
-            y[i] = T[i, 3]
-            for j in range(3):
-                y[i] += T[i, j] * points[n, j]
-        if y[2] < 0.05:
+        y = points[n]
+        if not is_used[n] or y[2] < 0.05:
             continue
         _reprojection_rows(y, pixels[n], sigmas[n], camera, r, J)
-        _plane_row(y, T[:3, :3] @ normals[n], pixels[n], depths[n], camera, r, J)
+        _plane_row(y, normals[n], pixels[n], depths[n], camera, r, J)
         r[2] /= depth_sigmas[n]
-        J[2] /= depth_sigmas[n]
+        for i in range(6):
+            J[2, i] /= depth_sigmas[n]
         error = np.sqrt(r[0] * r[0] + r[1] * r[1])
         plane = abs(r[2])
         weight = 1.0 if error <= huber else huber / error
@@ -208,8 +202,8 @@ def _reprojection_rows(y, pixel, sigma, camera, r, J):  # noqa: PLR0913 - compil
     for k in range(2):
         r[k] = (camera[k] * y[k] / z + camera[2 + k] - pixel[k]) / sigma
     a, b = camera[0] / z / sigma, camera[1] / z / sigma
-    _row(a, 0.0, -a * y[0] / z, y, J[0])
-    _row(0.0, b, -b * y[1] / z, y, J[1])
+    _row(a, 0.0, -a * y[0] / z, y[0], y[1], z, J[0])
+    _row(0.0, b, -b * y[1] / z, y[0], y[1], z, J[1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -218,31 +212,25 @@ def _plane_row(y, normal, pixel, depth, camera, r, J):  # noqa: PLR0913 - compil
 
     Where no normal is known it is the difference in depth; without depth it is nothing.
     """
-    r[2] = 0.0
-    J[2] = 0.0
+    nx, ny, nz = normal[0], normal[1], normal[2]
     if depth <= 0.0:
-        return
-    measured = np.array(
-        [
-            (pixel[0] - camera[2]) / camera[0] * depth,
-            (pixel[1] - camera[3]) / camera[1] * depth,
-            depth,
-        ]
-    )
-    if normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2 < 0.5:
+        r[2] = 0.0
+        _row(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, J[2])
+    elif nx * nx + ny * ny + nz * nz < 0.5:
         r[2] = y[2] - depth
-        _row(0.0, 0.0, 1.0, y, J[2])
-        return
-    for i in range(3):
-        r[2] += normal[i] * (y[i] - measured[i])
-    # The plane stands still in the world: it is the measured point that turns with the camera.
-    _row(normal[0], normal[1], normal[2], measured, J[2])
+        _row(0.0, 0.0, 1.0, y[0], y[1], y[2], J[2])
+    else:
+        mx = (pixel[0] - camera[2]) / camera[0] * depth
+        my = (pixel[1] - camera[3]) / camera[1] * depth
+        r[2] = nx * (y[0] - mx) + ny * (y[1] - my) + nz * (y[2] - depth)
+        # The plane stands still in the world: the measured point is what turns with the camera.
+        _row(nx, ny, nz, mx, my, depth, J[2])
 
 
 @numba.njit(cache=True, nogil=True)
-def _row(gx, gy, gz, lever, out):  # pragma: no cover - compiled
-    """Derivative by a camera twist of g . y, where y moves by -(rho + phi x lever)."""
+def _row(gx, gy, gz, x, y, z, out):  # noqa: PLR0913 - compiled
+    """Derivative by a camera twist of g . p, where p moves by -(rho + phi x (x, y, z))."""
     out[0], out[1], out[2] = -gx, -gy, -gz
-    out[3] = gy * lever[2] - gz * lever[1]
-    out[4] = gz * lever[0] - gx * lever[2]
-    out[5] = gx * lever[1] - gy * lever[0]
+    out[3] = gy * z - gz * y
+    out[4] = gz * x - gx * z
+    out[5] = gx * y - gy * x
