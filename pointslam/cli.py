@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from shared.errors import PointSlamError
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; an error of ours is one line and exit code 2."""
     arguments = _parser().parse_args(argv)
+    # SIGTERM unwinds like Ctrl-C, so that services end and scratch folders go.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     command: Callable[[argparse.Namespace], None] = arguments.command
     try:
         command(arguments)
