@@ -10,6 +10,7 @@ from torch import Tensor
 from services.mapping.config import LossConfig
 from services.mapping.rasterizer import Rendered
 from services.mapping.ssim import SsimTarget, ssim
+from services.mapping.ssim_torch import ssim_torch
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
 
@@ -22,7 +23,7 @@ class Target:
 
     colour: Tensor  # [H, W, 3], 0 to 1
     depth: Tensor  # [H, W], metres, 0 where there is none
-    ssim: SsimTarget
+    ssim: SsimTarget | None  # what comparisons on the CPU share
     intrinsics: Intrinsics
 
     @staticmethod
@@ -30,7 +31,14 @@ class Target:
         """Colour as floats, depth, and the target's part of SSIM."""
         colour = torch.from_numpy(image.rgb).to(device).float() / 255.0
         depth = torch.from_numpy(image.depth_m).to(device)
-        return Target(colour, depth, SsimTarget.of(colour), image.intrinsics)
+        shared = SsimTarget.of(colour) if device.type == "cpu" else None
+        return Target(colour, depth, shared, image.intrinsics)
+
+    def similarity(self, image: Tensor) -> Tensor:
+        """Mean SSIM of an image [H, W, 3] with this one."""
+        if self.ssim is None:
+            return ssim_torch(image, self.colour)
+        return ssim(image, self.ssim)
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ def mapping_loss(
     error = image - target.colour
     total = (1.0 - config.ssim) * error.abs().mean()
     if config.ssim > 0:
-        total = total + config.ssim * (1.0 - ssim(image, target.ssim))
+        total = total + config.ssim * (1.0 - target.similarity(image))
     if config.depth > 0:
         total = total + config.depth * depth_error(rendered, target.depth, config)
     return Loss(total, error.detach().square().mean())

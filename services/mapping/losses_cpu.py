@@ -17,7 +17,6 @@ from torch.autograd.function import once_differentiable
 from services.mapping.config import LossConfig
 from services.mapping.losses import MIN_DEPTH_ALPHA, Appearance, Loss, Target
 from services.mapping.rasterizer import Rendered
-from services.mapping.ssim import ssim
 from services.mapping.workers import in_pieces
 
 Array = NDArray[np.float32]
@@ -36,7 +35,7 @@ def mapping_loss_cpu(
     )  # pyright: ignore[reportGeneralTypeIssues]
     total = (1.0 - config.ssim) * colour + config.depth * depth
     if config.ssim > 0:
-        total = total + config.ssim * (1.0 - ssim(image, target.ssim))
+        total = total + config.ssim * (1.0 - target.similarity(image))
     return Loss(total, squared.detach())
 
 

@@ -276,9 +276,8 @@ class Mapper:
     def _add_view(self, keyframe: NewKeyframe) -> RgbdImage:
         frame = keyframe.frame
         view = TrainingView(frame.seq, frame.t_ns, frame, keyframe.T_world_camera)
-        self.views.add(view)
+        image = self.views.add(view)
         self._placed[frame.seq] = keyframe.T_world_camera
-        image = self.views.image(frame.seq)
         self.exposures.add(frame.seq, frame.t_ns)
         mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
         self._background += (mean - self._background) / len(self.views)

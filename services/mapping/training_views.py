@@ -77,9 +77,15 @@ class TrainingViews:
         """Seqs of all keyframes, ascending."""
         return list(self._views)
 
-    def add(self, view: TrainingView) -> None:
-        """Add a keyframe; the newest one."""
+    def add(self, view: TrainingView) -> RgbdImage:
+        """Add a keyframe, the newest one; returns its image.
+
+        Raises:
+            InputError: its images cannot be decoded; it is not added.
+        """
+        image = self._images.get(view.seq, lambda: rectify(view.frame, self._calibration))
         self._views[view.seq] = view
+        return image
 
     def set_pose(self, seq: int, T_world_camera: NDArray[np.float64]) -> None:
         """Replace a keyframe's pose."""

@@ -13,6 +13,8 @@ from services.mapping.config import LearningRates, LossConfig
 from services.mapping.losses import Appearance, Target, depth_error, mapping_loss
 from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.rasterizer import Rendered, ScreenStatistics
+from services.mapping.ssim import ssim
+from services.mapping.ssim_torch import ssim_torch
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
 
@@ -58,6 +60,13 @@ def test_the_cpu_loss_and_its_gradients_equal_the_plain_ones(image):
 
     for expected, found in zip(*results, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
+
+
+def test_ssim_in_plain_torch_equals_the_kernels():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(30, 40, 3, generator=generator) for _ in range(2))
+
+    torch.testing.assert_close(ssim_torch(a, b), ssim(a, b), rtol=1e-4, atol=1e-5)
 
 
 def test_a_perfect_render_has_no_loss(image, target):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from services.mapping.export import bake
 from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
 from shared import se3
+from shared.errors import InputError
 from shared.maps import RenderRequest
 from shared.tracks import KeyframePoses
 
@@ -142,6 +145,19 @@ def test_anchors_grow_where_the_screen_gradient_is_large(mapper, insert):
     assert (mapper.anchors.rows["position"][-1] - place).abs().max() <= side / 2 + 1e-6
 
 
+def test_a_keyframe_whose_image_is_damaged_is_refused_and_not_trained_on(
+    mapper, insert, frame, true_pose
+):
+    insert(mapper, 0)
+    damaged = replace(frame(4), rgb=replace(frame(4).rgb, bytes=b"\xff\xd8 no image"))
+    poses = KeyframePoses(2, np.array([0, 4]), np.stack([true_pose(0), true_pose(4)]))
+
+    with pytest.raises(InputError, match="rgb"):
+        mapper.insert_keyframe(NewKeyframe(damaged, poses, np.zeros((0, 3))))
+
+    assert mapper.views.seqs() == [0]
+
+
 def test_a_baked_map_holds_only_gaussians_that_show(mapper, insert):
     insert(mapper, 0)
     mapper.iterate(10)
@@ -157,9 +173,8 @@ def test_a_map_without_keyframes_bakes_to_nothing(mapper):
 
 
 def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose):
-    blind = frame(0)
-    depth = type(blind.depth)(blind.depth.encoding, bytes(len(blind.depth.bytes)))
-    keyframe = type(blind)(0, 0, blind.rgb, depth)
+    blind = frame(0).depth
+    keyframe = replace(frame(0), depth=replace(blind, bytes=bytes(len(blind.bytes))))
     poses = KeyframePoses(1, np.array([0]), true_pose(0)[None])
 
     added = mapper.insert_keyframe(NewKeyframe(keyframe, poses, np.zeros((0, 3))))

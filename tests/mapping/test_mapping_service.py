@@ -81,9 +81,18 @@ def bus(endpoint) -> Iterator[Bus]:
 
 
 @pytest.fixture
-def start(start_at, tmp_path) -> Callable[[], subprocess.Popen]:
-    """Starts the mapper m0 on this test's data folder."""
-    return lambda: start_at("m0", tmp_path / "data")
+def start(start_at, tmp_path) -> Iterator[Callable[[], subprocess.Popen]]:
+    """Starts the mapper m0 on this test's data folder; it ends with the test."""
+    started = []
+
+    def run() -> subprocess.Popen:
+        started.append(start_at("m0", tmp_path / "data"))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.wait()
 
 
 def wait_for_mapper(bus: Bus, mapper: str) -> None:
