@@ -46,7 +46,7 @@ class RegistrationConfig:
     translation_tolerance_m: float = 2e-4
     rotation_tolerance_rad: float = 2e-4
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
-    effective_share: float = 0.02  # residuals of neighbours are not independent
+    effective_share: float = 0.1  # residuals of neighbours are not independent
     model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas
 
     def __post_init__(self) -> None:
