@@ -1,6 +1,8 @@
 """Mapping alone, with the true poses of a sequence: quality on held-out frames, and time.
 
-python -m benchmarks.mapping SEQUENCE [--frames N] [--refine N] [--json FILE]
+python -m benchmarks.mapping [SEQUENCE] [--frames N] [--refine N] [--json]
+
+Without a sequence, a procedural room is recorded into a temporary folder first.
 """
 
 from __future__ import annotations
@@ -9,9 +11,11 @@ import argparse
 import json
 import resource
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from pointslam.datasets import FileSequence, is_held_out, open_sequence
+from pointslam.synth import SynthOptions, write_sequence
 from services.mapping.config import MappingConfig
 from services.mapping.pipeline import MapFigures, Mapper, NewKeyframe
 from services.mapping.ssim import ssim
@@ -44,14 +49,14 @@ class Score:
 def arguments(argv: list[str]) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sequence", type=Path)
+    parser.add_argument("sequence", type=Path, nargs="?")
     parser.add_argument("--frames", type=int, default=None, help="the first N only")
     parser.add_argument("--every", type=int, default=5, help="frames between keyframes")
     parser.add_argument("--holdout", type=int, default=8)
     parser.add_argument("--refine", type=int, default=200, help="iterations after the last frame")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--json", type=Path, help="write the numbers here too")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser.parse_args(argv)
 
 
@@ -140,40 +145,57 @@ def floats(rgb: NDArray[np.uint8]) -> torch.Tensor:
     return torch.from_numpy(rgb.astype(np.float32) / np.float32(255.0))
 
 
-def measure(options: argparse.Namespace) -> dict[str, object]:
+def measure(sequence: FileSequence, options: argparse.Namespace) -> dict[str, Any]:
     """Run both phases and score each."""
-    sequence = open_sequence(options.sequence)
     config = override(MappingConfig(), read_overrides(None, options.set))
     mapper = Mapper(sequence.calibration, config, options.seed, torch.device("cpu"))
     online_s = run_online(mapper, sequence, options)
-    result: dict[str, object] = {
+    result: dict[str, Any] = {
         "sequence": sequence.name,
         "keyframes": len(mapper.views),
-        "online_s": round(online_s, 1),
+        "online_s": online_s,
         "online": vars(held_out_score(mapper, sequence, options)),
-        "stages_ms": {k: round(v, 1) for k, v in mapper.stages.medians().items()},
+        "stages_ms": mapper.stages.medians(),
     }
     if options.refine:
-        result["refinement_s"] = round(run_refinement(mapper, options.refine), 1)
+        result["refinement_s"] = run_refinement(mapper, options.refine)
         result["refined"] = vars(held_out_score(mapper, sequence, options))
-    figures = MapFigures.of(mapper)
-    result["map"] = vars(figures)
+    result["map"] = vars(MapFigures.of(mapper))
     result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     return result
 
 
+def table(result: dict[str, Any]) -> str:
+    """The measurements for people."""
+    lines = [
+        f"{result['sequence']}: {result['keyframes']} keyframes, {result['map']['anchors']} anchors"
+    ]
+    for phase, seconds in (("online", "online_s"), ("refined", "refinement_s")):
+        if phase in result:
+            score = result[phase]
+            lines.append(
+                f"{phase:10} {score['psnr_db']:6.2f} dB  SSIM {score['ssim']:.3f}  "
+                f"depth {100 * score['depth_l1_m']:.2f} cm  {result[seconds]:7.1f} s  "
+                f"({score['views']} held-out views)"
+            )
+    stages = "  ".join(f"{name} {ms:.1f}" for name, ms in result["stages_ms"].items())
+    return "\n".join([*lines, f"median ms: {stages}", f"peak {result['peak_rss_mb']} MB"])
+
+
 def main(argv: list[str]) -> int:
-    """Print the measurements as JSON."""
+    """Print the measurements."""
     options = arguments(argv)
     try:
         warm_up()
-        text = json.dumps(measure(options), indent=1)
+        with tempfile.TemporaryDirectory() as folder:
+            if options.sequence is None:
+                options.sequence = Path(folder) / "room"
+                write_sequence(options.sequence, SynthOptions(num_frames=80))
+            result = measure(open_sequence(options.sequence), options)
     except PointSlamError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    print(text)
-    if options.json:
-        options.json.write_text(text)
+    print(json.dumps(result, indent=1) if options.json else table(result))
     return 0
 
 
