@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -218,6 +219,12 @@ def _relative_errors(poses: Poses, truth: Poses, gap: int) -> tuple[float, float
     return float(np.sqrt(distances.mean())), float(np.sqrt(np.square(angles).mean()))
 
 
+_HEADER = (
+    "sequence        frames lost coarse reloc  kfs ateOnl.cm ateFin.cm rpe1mm rpe30mm rpe30d "
+    "  ms50   ms95"
+)
+
+
 def _print_row(row: Row) -> None:
     print(
         f"{row.sequence:16} {row.frames:5d} {row.lost:4d} {row.coarse_only:6d} "
@@ -230,29 +237,50 @@ def _print_row(row: Row) -> None:
     print(f"    median ms: {stages}", flush=True)
 
 
-def main(argv: list[str]) -> int:
-    """Run over the folders named in argv and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sequences", nargs="+", type=Path)
+def _without_nan(row: Row) -> dict[str, object]:
+    return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(row).items()}
+
+
+def _default_sequences() -> list[Path]:
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    data = Path(os.environ.get("POINTSLAM_DATA", beside))
+    return sorted(path.parent for path in data.glob("*/associations.txt"))
+
+
+def _arguments(argv: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequences", nargs="*", type=Path)
     parser.add_argument("--frames", type=int, help="at most so many")
     parser.add_argument("--stride", type=int, default=1, help="use every so many")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", nargs="?", const="-", help="to a file, or instead of the table")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    arguments = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str]) -> int:
+    """Run over the folders named in argv and print a table or JSON."""
+    arguments = _arguments(argv)
+    sequences = arguments.sequences or _default_sequences()
+    if not sequences:
+        print("no sequence named, and none in $POINTSLAM_DATA or ../shared/data", file=sys.stderr)
+        return 2
     cv2.setNumThreads(1)
     config = override(TrackingConfig(), read_overrides(None, arguments.set))
-    print(
-        "sequence        frames lost coarse reloc  kfs ateOnl.cm ateFin.cm rpe1mm rpe30mm rpe30d "
-        "  ms50   ms95"
-    )
+    as_table = arguments.json != "-"
+    if as_table:
+        print(_HEADER)
     rows = []
-    for path in arguments.sequences:
+    for path in sequences:
         folder = Folder(path)
         indices = list(range(0, len(folder), arguments.stride))[: arguments.frames]
         rows.append(run(folder, path.name, indices, config))
-        _print_row(rows[-1])
+        if as_table:
+            _print_row(rows[-1])
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+        text = json.dumps([_without_nan(row) for row in rows], indent=1)
+        print(text) if arguments.json == "-" else Path(arguments.json).write_text(text)
     return 0
 
 
