@@ -1,6 +1,6 @@
 """`decoder.decode` for CPUs: pieces that fit the cache, on all cores, with its own backward.
 
-Products of pieces of a thousand rows run at 90 GFLOP/s on a core, those of whole matrices that
+Products of pieces of a few thousand rows run at 90 GFLOP/s on a core, those of whole matrices that
 leave the cache at 17; autograd's graph would do the latter. Products go through torch, whose
 number of threads can be set at run time: a BLAS with threads of its own under ours was measured
 to be ten times slower.
@@ -28,7 +28,7 @@ from services.mapping.rasterizer import Gaussians
 from services.mapping.workers import in_pieces
 
 Array = NDArray[np.float32]
-_PIECE = 2048
+_PIECE = 4096
 _OUTPUTS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "colours": 3}
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
@@ -129,6 +129,18 @@ def _product(a: NDArray[Any], b: NDArray[Any]) -> Array:
     return torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
 
 
+def _over_children(values: Array) -> Array:
+    """Sum of [n, k, 3] over k; a product is five times faster than numpy's sum here."""
+    count, k, width = values.shape
+    fold = np.tile(np.eye(width, dtype=np.float32), (k, 1))
+    return _product(values.reshape(count, k * width), fold)
+
+
+def _over_rows(values: Array) -> Array:
+    """Sum of [n, m] over n."""
+    return _product(np.ones((1, len(values)), np.float32), values)[0]
+
+
 def _sigmoid(x: Array) -> Array:
     """In place; through tanh, which is vectorised."""
     x *= _HALF
@@ -188,8 +200,8 @@ def _backward(piece: _Piece, passed: _BackwardPass) -> dict[str, NDArray[Any]]:
     by_scale = upstream["scales"][part] * scales
     by_mean = upstream["means"][part] * sizes[..., :3]
     down.offsets[part] = by_mean
-    down.scalings[part, 3:] = by_scale.sum(1)
-    down.scalings[part, :3] = (by_mean * rows.offsets[part]).sum(1)
+    down.scalings[part, 3:] = _over_children(by_scale)
+    down.scalings[part, :3] = _over_children(by_mean * rows.offsets[part])
 
     drawn = (piece.opacities > 0.0) * (_ONE - np.square(piece.opacities))
     by_opacity = upstream["opacities"][part].reshape(count, -1) * drawn
@@ -204,12 +216,12 @@ def _backward(piece: _Piece, passed: _BackwardPass) -> dict[str, NDArray[Any]]:
         columns = slice(i * h, (i + 1) * h)
         by_hidden[:, columns] = _product(gradient, weights[f"{name}_weight"].T)
         result[f"{name}_weight"] = _product(piece.hidden[:, columns].T, gradient)
-        result[f"{name}_bias"] = gradient.sum(0)
+        result[f"{name}_bias"] = _over_rows(gradient)
     by_hidden *= piece.hidden > 0.0
     features = _product(by_hidden, weights["hidden_weight"][:FEATURES].T)
     features += _product(by_colour, weights["skip_weight"].T)
     down.features[part] = features
     result["hidden_weight"] = _product(piece.inputs.T, by_hidden)
-    result["hidden_bias"] = by_hidden.sum(0)
+    result["hidden_bias"] = _over_rows(by_hidden)
     result["skip_weight"] = _product(piece.inputs[:, :FEATURES].T, by_colour)
     return result

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import io
+import os
 import tarfile
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -14,21 +16,26 @@ from numpy.typing import NDArray
 from services.mapping.decoder import VisibleAnchors, decode
 from services.mapping.pipeline import Mapper
 from services.mapping.rasterizer import Gaussians
+from services.mapping.snapshot import snapshot_folders
 from services.mapping.storage import storage_errors
 from shared.maps import ExportChunk
 
 SH_DC = 0.28209479177387814  # the constant basis function: colour = 0.5 + SH_DC * f_dc
 MIN_OPACITY = 1.0 / 255.0
+_PACKED = (".msgpack", ".bin")
 _PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 
 
-def chunks(data: bytes, size: int) -> Iterator[ExportChunk]:
-    """A file in pieces of `size` bytes; one empty piece for an empty file."""
-    for offset in range(0, max(1, len(data)), size):
-        yield ExportChunk(offset, len(data), data[offset : offset + size])
+def chunks(file: BinaryIO, size: int) -> Iterator[ExportChunk]:
+    """A file in pieces of `size` bytes, which is closed then; one piece for an empty file."""
+    with file:
+        total = file.seek(0, os.SEEK_END)
+        for offset in range(0, max(1, total), size):
+            file.seek(offset)
+            yield ExportChunk(offset, total, file.read(size))
 
 
 def export_ply(mapper: Mapper) -> bytes:
@@ -75,11 +82,20 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     return text.encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
 
 
-def pack_folder(session: Path) -> bytes:
-    """The session's folder as an uncompressed tar; a log's growth meanwhile is left out."""
-    buffer = io.BytesIO()
-    with storage_errors(str(session)), tarfile.open(fileobj=buffer, mode="w") as archive:
-        for path in sorted(p for p in session.rglob("*") if p.is_file() and p.name != "lock"):
-            if ".tmp" not in str(path.relative_to(session)):
-                archive.add(path, arcname=str(Path(session.name) / path.relative_to(session)))
-    return buffer.getvalue()
+def pack_folder(session: Path) -> BinaryIO:
+    """The session's folder as an uncompressed tar in a file without a name, at its start.
+
+    It holds the logs and the newest snapshot; what a log grows meanwhile is left out.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    snapshots = snapshot_folders(session)
+    members = [p for p in session.iterdir() if p.is_file() and p.suffix in _PACKED]
+    with storage_errors(str(session)):
+        file = tempfile.TemporaryFile(dir=session)  # noqa: SIM115 - the reader closes it
+        with tarfile.open(fileobj=file, mode="w") as archive:
+            for path in sorted([*members, *snapshots[-1:]]):
+                archive.add(path, arcname=f"{session.name}/{path.name}")
+        file.seek(0)
+    return file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -123,11 +124,13 @@ class Session:
         """The map as a file, in pieces."""
         size = self._surroundings.config.owner.chunk_bytes
         if request.format is ExportFormat.SNAPSHOT:
-            self.save()
-            return chunks(pack_folder(self._folder.path), size)
+            if not self._is_saved():
+                self.save()
+            with self._saving:
+                return chunks(pack_folder(self._folder.path), size)
         if request.format is ExportFormat.MESH:
-            return chunks(export_mesh(self._worker.visit), size)
-        return chunks(self._worker.visit(export_ply), size)
+            return chunks(io.BytesIO(export_mesh(self._worker.visit)), size)
+        return chunks(io.BytesIO(self._worker.visit(export_ply)), size)
 
     def refine(self, request: RefineRequest) -> JobStatus:
         """Start a refinement over all keyframes."""
@@ -197,14 +200,16 @@ class Session:
         while not self._is_closed.wait(interval_s):
             self._save_if_near()
 
+    def _is_saved(self) -> bool:
+        return self._saved == (self.ledger.entries, self._worker.iterations)
+
     def _save_if_near(self) -> None:
         """Save what is new, unless the map has far to go to the end of the log.
 
         Then the next start replays the log; waiting would keep new entries out for minutes.
         """
         owner = self._surroundings.config.owner
-        is_new = self._saved != (self.ledger.entries, self._worker.iterations)
-        if not is_new or self._worker.pending > 2 * owner.max_pending:
+        if self._is_saved() or self._worker.pending > 2 * owner.max_pending:
             return
         try:
             reply = self.save()

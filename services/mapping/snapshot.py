@@ -49,7 +49,7 @@ def write_snapshot(session: Path, snapshot: Snapshot) -> int:
     Raises:
         StorageError: the disk refused; older snapshots are as they were.
     """
-    numbers = [_number(folder) for folder in _folders(session)]
+    numbers = [_number(folder) for folder in snapshot_folders(session)]
     final = session / f"snapshot-{max(numbers, default=0) + 1:06d}"
     temporary = final.with_suffix(".tmp")
     with storage_errors(str(final)):
@@ -62,14 +62,14 @@ def write_snapshot(session: Path, snapshot: Snapshot) -> int:
             raise StorageError(f"{final}: {error}") from error
         temporary.rename(final)
         sync_folder(session)
-    for folder in _folders(session)[:-_KEPT]:
+    for folder in snapshot_folders(session)[:-_KEPT]:
         shutil.rmtree(folder, ignore_errors=True)
     return size
 
 
 def read_newest(session: Path) -> Snapshot | None:
     """The newest snapshot whose checksums hold; None when there is none."""
-    for folder in reversed(_folders(session)):
+    for folder in reversed(snapshot_folders(session)):
         try:
             return _read(folder)
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
@@ -77,7 +77,8 @@ def read_newest(session: Path) -> Snapshot | None:
     return None
 
 
-def _folders(session: Path) -> list[Path]:
+def snapshot_folders(session: Path) -> list[Path]:
+    """Folders of whole snapshots, oldest first."""
     found = [p for p in session.glob("snapshot-*") if p.suffix != ".tmp" and p.is_dir()]
     return sorted(found, key=_number)
 
@@ -98,6 +99,7 @@ def _write_files(folder: Path, snapshot: Snapshot) -> int:
     for path in folder.iterdir():
         with path.open("rb") as file:
             os.fsync(file.fileno())
+    sync_folder(folder)
     return sum(path.stat().st_size for path in folder.iterdir())
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import torch
 
@@ -64,7 +66,7 @@ def test_a_map_of_nothing_is_a_ply_without_vertices():
 def test_pieces_join_to_the_file():
     data = bytes(range(256)) * 5
 
-    pieces = list(chunks(data, 100))
+    pieces = list(chunks(io.BytesIO(data), 100))
 
     assert b"".join(piece.bytes for piece in pieces) == data
     assert [piece.offset for piece in pieces] == list(range(0, 1280, 100))
@@ -72,4 +74,4 @@ def test_pieces_join_to_the_file():
 
 
 def test_an_empty_file_is_one_empty_piece():
-    assert [piece.total for piece in chunks(b"", 100)] == [0]
+    assert [piece.total for piece in chunks(io.BytesIO(), 100)] == [0]
