@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from services.mapping.config import MappingConfig
-from services.mapping.ledger import count_keyframes
+from services.mapping.log import count_keyframes
 from services.mapping.session import Session, Surroundings
 from services.mapping.storage import (
     SessionFolder,
@@ -28,7 +28,13 @@ from services.mapping.storage import (
 from services.mapping.worker import LIVE, OFFLINE
 from shared import codec
 from shared.bus import Bus, Keys
-from shared.errors import ConflictError, InputError, NotFoundError, PointSlamError
+from shared.errors import (
+    ConflictError,
+    InputError,
+    NotFoundError,
+    PointSlamError,
+    StorageError,
+)
 from shared.maps import (
     DeleteRequest,
     Empty,
@@ -113,10 +119,11 @@ class MapperHost:
             return self._served[request.session].session.opening()
 
     def list(self) -> SessionList:
-        """All sessions on this mapper's disk."""
-        with self._lock:
+        """All sessions on this mapper's disk that can be read."""
+        with self._lock, storage_errors(str(self._settings.data)):
             folders = sorted(p for p in self._settings.data.iterdir() if has_session(p))
-            return SessionList(tuple(self._summary(folder) for folder in folders))
+            summaries = [self._summary(folder) for folder in folders]
+        return SessionList(tuple(s for s in summaries if s is not None))
 
     def delete(self, request: DeleteRequest) -> Empty:
         """Close a session and remove every byte of it.
@@ -150,6 +157,7 @@ class MapperHost:
             return SessionFolder(path)
         record = _new_record(request)
         folder = SessionFolder(path)
+        folder.clear()
         folder.write_record(record)
         return folder
 
@@ -179,15 +187,20 @@ class MapperHost:
     def _publish(self, session: str, poses: KeyframePoses) -> None:
         self._bus.publish(Keys.revisions(session), poses)
 
-    def _summary(self, folder: Path) -> SessionSummary:
-        record = read_record(folder)
+    def _summary(self, folder: Path) -> SessionSummary | None:
+        """None for a damaged session: it must not hide the others."""
         served = self._served.get(folder.name)
-        keyframes = served.session.ledger.num_keyframes if served else count_keyframes(folder)
+        try:
+            record = read_record(folder)
+            keyframes = sum(count_keyframes(path) for path in folder.glob("log-*.bin"))
+        except StorageError as error:
+            LOGGER.warning("not listed: %s", error)
+            return None
         return SessionSummary(
             session=record.session,
             created_ns=record.created_ns,
             mode=record.mode,
-            keyframes=keyframes,
+            keyframes=served.session.ledger.num_keyframes if served else keyframes,
             is_open=served is not None,
         )
 
@@ -213,8 +226,8 @@ def _answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]
 def _withdraw(served: _Served, is_saved: bool) -> None:
     for stop in served.stops:
         stop()
+    served.advances.shutdown(wait=True, cancel_futures=True)  # none may find the log closed
     served.session.close(is_saved)
-    served.advances.shutdown(wait=True, cancel_futures=True)
 
 
 def _new_record(request: OpenRequest) -> SessionRecord:

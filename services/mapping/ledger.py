@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -166,12 +165,6 @@ class Ledger:
     def close(self) -> None:
         """Close the log."""
         self._log.close()
-
-
-def count_keyframes(session: Path) -> int:
-    """Keyframes in the logs of a session that nobody has open."""
-    logs = sorted(session.glob("log-*.bin"))
-    return sum(entry.keyframe is not None for path in logs for entry in read_log(path))
 
 
 def _check(entry: Advance) -> None:

@@ -21,6 +21,8 @@ from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
 _HEAD = struct.Struct("<II")
+# How every entry without a keyframe ends: the last field of `Advance`, a name and nothing.
+_NO_KEYFRAME = codec.pack({"keyframe": None})[1:]
 
 
 class SessionLog:
@@ -82,6 +84,20 @@ def read_log(path: Path) -> Iterator[Advance]:
                 LOGGER.warning("%s: %d bytes at the end are torn", path, size - start)
                 return
             yield _decoded(payload, path)
+
+
+def count_keyframes(path: Path) -> int:
+    """Keyframes in a log, by the ends of its entries: their images are neither read nor checked."""
+    count = 0
+    with storage_errors(str(path)), path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        while len(head := file.read(_HEAD.size)) == _HEAD.size:
+            end = file.tell() + _HEAD.unpack(head)[0]
+            if end > size:
+                break
+            file.seek(max(file.tell(), end - len(_NO_KEYFRAME)))
+            count += file.read(end - file.tell()) != _NO_KEYFRAME
+    return count
 
 
 def _decoded(payload: bytes, path: Path) -> Advance:

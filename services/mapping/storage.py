@@ -20,7 +20,7 @@ from shared.camera import Calibration
 from shared.errors import ConflictError, InputError, NotFoundError, StorageError
 
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")
-_RECORD = "session.msgpack"
+_RECORD, _LOCK = "session.msgpack", "lock"
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ class SessionFolder:
         self.path = path
         with storage_errors(str(path)):
             path.mkdir(parents=True, exist_ok=True)
-            self._lock = (path / "lock").open("w")
+            sync_folder(path.parent)
+            self._lock = (path / _LOCK).open("w")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -94,6 +95,15 @@ class SessionFolder:
     def close(self) -> None:
         """Let another process have it."""
         self._lock.close()
+
+    def clear(self) -> None:
+        """Remove what a broken removal left: it must not become part of a new session."""
+        with storage_errors(str(self.path)):
+            for path in self.path.iterdir():
+                if path.is_dir():
+                    shutil.rmtree(path)
+                elif path.name != _LOCK:
+                    path.unlink()
 
     def take_up(self) -> SessionRecord:
         """The record, with a new epoch that is on disk already."""

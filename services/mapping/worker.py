@@ -7,6 +7,7 @@ map is optimised whenever it has keyframes and no entry waits.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -17,7 +18,7 @@ from typing import TypeVar
 from services.mapping.config import MappingConfig
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.turns import Turns
-from shared.errors import ConflictError
+from shared.errors import ConflictError, UnavailableError
 from shared.maps import JobStatus
 
 LOGGER = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ class MapWorker:
         self._queue: deque[NewKeyframe | None] = deque()  # None: a frame that is no keyframe
         self._is_busy = False
         self._is_stopping = False
-        self._last_entry_s = time.monotonic()
+        self._last_entry_s = -math.inf  # a map that was taken up stays as it was until one comes
         self._job = JobStatus(is_running=False, iterations_done=0, iterations_total=0)
         self.times = WorkTimes()
         self._thread = threading.Thread(target=self._run, name="map-worker", daemon=True)
@@ -88,8 +89,14 @@ class MapWorker:
         self._wait(lambda: self.pending <= limit)
 
     def drain(self) -> None:
-        """Wait until every entry is worked through."""
+        """Wait until every entry is worked through.
+
+        Raises:
+            UnavailableError: `stop` came first.
+        """
         self._wait(lambda: self.pending == 0)
+        if self.pending:
+            raise UnavailableError("the session is being closed")
 
     def visit(self, question: Callable[[Mapper], T]) -> T:
         """Ask the mapper something between two of its steps."""

@@ -206,3 +206,30 @@ def test_the_list_names_open_and_closed_sessions(start, bus, calibration, entry)
 
     found = [(s.session, s.keyframes, s.is_open) for s in sessions]
     assert found == [("new", 0, True), ("old", 1, False)]
+
+
+def test_a_damaged_session_does_not_hide_the_others(start, bus, calibration, tmp_path):
+    damaged = tmp_path / "data" / "damaged"
+    damaged.mkdir(parents=True)
+    (damaged / "session.msgpack").write_bytes(b"no record")
+    start()
+    opened(bus, calibration, "good")
+
+    sessions = bus.query(Keys.mapper("m0", "list"), Empty(), SessionList, 30.0).sessions
+
+    assert [s.session for s in sessions] == ["good"]
+
+
+def test_a_new_session_holds_nothing_of_a_removal_that_broke_off(
+    start, bus, calibration, entry, tmp_path
+):
+    first = start()
+    advance(bus, opened(bus, calibration), entry(0))
+    first.kill()
+    first.wait()
+    (tmp_path / "data" / "room" / "session.msgpack").unlink()
+    start()
+
+    opening = opened(bus, calibration)
+
+    assert opening.last is None and len(opening.keyframe_poses.seqs) == 0

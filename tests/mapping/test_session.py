@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from services.mapping.config import MappingConfig, OwnerConfig
 from services.mapping.session import Session, Surroundings
 from services.mapping.storage import SessionFolder, SessionRecord
 from shared import se3
-from shared.errors import ConflictError, InputError
+from shared.errors import ConflictError, InputError, UnavailableError
 from shared.maps import ExportFormat, ExportRequest, RefineRequest, RenderRequest
 from shared.tracks import ContextRequest
 
@@ -210,6 +211,30 @@ def test_a_live_map_is_optimised_while_nothing_comes(open_session, entry):
         os.sched_yield()
 
     assert session.info().pending == 0
+
+
+def test_a_live_map_that_was_taken_up_rests_until_an_entry_comes(open_session, entry):
+    first = open_session(mode="live")
+    first.advance(entry(0))
+    first.close()
+
+    again = open_session()
+    before = again.info().iterations
+    time.sleep(0.3)
+
+    assert again.info().iterations == before
+
+
+def test_no_snapshot_tells_of_entries_that_a_closing_map_has_not_seen(
+    open_session, entry, tmp_path
+):
+    session = open_session()
+    session._worker.stop()
+    session.advance(entry(0))
+
+    with pytest.raises(UnavailableError, match="closed"):
+        session.save()
+    assert not list(tmp_path.glob("room/snapshot-*"))
 
 
 def test_a_render_with_a_pose_that_is_no_number_is_refused(open_session):

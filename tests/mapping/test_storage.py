@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.log import SessionLog, read_log
+from services.mapping.log import SessionLog, count_keyframes, read_log
 from services.mapping.map_state import MapState
 from services.mapping.snapshot import Snapshot, read_newest, write_snapshot
-from services.mapping.storage import check_session_name, write_atomically
+from services.mapping.storage import SessionFolder, check_session_name, write_atomically
 from shared.errors import InputError, StorageError
 
 
@@ -57,6 +57,25 @@ def test_a_head_without_its_entry_is_left_out(written):
         file.write(b"\x10\x00\x00")
 
     assert len(list(read_log(written))) == 5
+
+
+def test_keyframes_are_counted_without_reading_them(written):
+    assert count_keyframes(written) == 2  # 0 and 4
+
+
+def test_a_torn_keyframe_does_not_count(written):
+    written.write_bytes(written.read_bytes()[:-1])
+
+    assert count_keyframes(written) == 1
+
+
+def test_what_a_broken_removal_left_can_be_cleared(written):
+    write_snapshot(written.parent, snapshot(1.0))
+    folder = SessionFolder(written.parent)
+
+    folder.clear()
+
+    assert [path.name for path in written.parent.iterdir()] == ["lock"]
 
 
 def test_damage_before_the_last_entry_is_an_error(written):
