@@ -36,7 +36,7 @@ class RegistrationConfig:
     """Coarse-to-fine point-to-plane registration to the local map."""
 
     voxel_sizes_m: tuple[float, ...] = (0.20, 0.10, 0.05)
-    sample_steps: tuple[int, ...] = (8, 4, 2)
+    sample_steps: tuple[int, ...] = (8, 6, 4)
     max_iterations: tuple[int, ...] = (8, 8, 8)
     min_normal_cos: float = 0.7
     depth_sigma_floor_m: float = 0.002
@@ -88,7 +88,7 @@ class RefinementConfig:
     rounds: int = 2
     iterations: int = 5
     outlier_chi2: float = 9.0
-    max_relinearisations: int = 4  # of matches and registration around the refined pose
+    max_relinearisations: int = 3  # of matches and registration around the refined pose
 
     def __post_init__(self) -> None:
         _require_positive(self, "pixel_sigma", "huber_sigma", "rounds", "max_relinearisations")
@@ -111,6 +111,8 @@ class VerificationConfig:
     depth_tolerance_per_m2: float = 0.01
     coarse_min_agreement: float = 0.85  # without features
     coarse_min_overlap: float = 0.08
+    coarse_max_step_m: float = 0.3  # from the prediction
+    coarse_max_step_deg: float = 15.0
     max_step_m: float = 1.0
     max_step_deg: float = 50.0
 

@@ -14,9 +14,8 @@ from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.prediction import predict
 from services.tracking.relocalization import locate
 from services.tracking.stopwatch import Stopwatch
-from services.tracking.verification import is_possible_step
+from services.tracking.verification import Step, is_possible_step, step_between
 from shared.frames import TrackingStatus, TrackRequest
-from shared.se3 import angle_rad, inverse
 from shared.tracks import CandidatesRequest
 
 
@@ -84,10 +83,12 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
     prior, config = job.request.prior, job.config.verification
     assert prior is not None
     frames = 1 + prior.lost_frames
-    is_possible = is_possible_step(prior.T_world_camera, estimate.T_world_camera, frames, config)
+    T = estimate.T_world_camera
+    is_possible = is_possible_step(prior.T_world_camera, T, frames, config)
     if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
         return TrackingStatus.TRACKED
-    if is_possible and prior.lost_frames == 0 and is_coarse(estimate, config):
+    T_predicted = predict(prior, job.request.frame)
+    if prior.lost_frames == 0 and is_coarse(estimate, T_predicted, config):
         return TrackingStatus.COARSE_ONLY
     return TrackingStatus.LOST
 
@@ -101,11 +102,10 @@ def is_as_predicted(
     estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
 ) -> bool:
     """About where it was expected, which takes fewer features to be sure of."""
-    step = inverse(T_predicted) @ estimate.T_world_camera
+    limit = Step(config.near_step_m, config.near_step_deg)
     return (
         estimate.inliers >= config.sure_inliers_near
-        and float(np.linalg.norm(step[:3, 3])) <= config.near_step_m
-        and np.degrees(angle_rad(step)) <= config.near_step_deg
+        and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
         and _agrees(estimate, config)
     )
 
@@ -127,11 +127,18 @@ def is_confirmed(estimate: Estimate, config: VerificationConfig) -> bool:
     )
 
 
-def is_coarse(estimate: Estimate, config: VerificationConfig) -> bool:
-    """Geometry alone holds the pose."""
+def is_coarse(
+    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
+) -> bool:
+    """Geometry alone holds the pose, about where it was expected.
+
+    Directions that the geometry leaves open keep the prediction; the covariance says how open.
+    """
+    limit = Step(config.coarse_max_step_m, config.coarse_max_step_deg)
     return (
         estimate.agreement.share >= config.coarse_min_agreement
         and estimate.registration.overlap >= config.coarse_min_overlap
+        and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
     )
 
 

@@ -42,6 +42,24 @@ def depth_agreement(
     return Agreement(on / max(1, on + front), on / max(1, on + front + behind), on)
 
 
+@dataclass(frozen=True)
+class Step:
+    """How far apart two poses are."""
+
+    metres: float
+    degrees: float
+
+    def is_within(self, limit: Step) -> bool:
+        """Neither part exceeds the limit's."""
+        return self.metres <= limit.metres and self.degrees <= limit.degrees
+
+
+def step_between(T_world_a: NDArray[np.float64], T_world_b: NDArray[np.float64]) -> Step:
+    """Distance and angle from one pose to another."""
+    T_a_b = inverse(T_world_a) @ T_world_b
+    return Step(float(np.linalg.norm(T_a_b[:3, 3])), float(np.degrees(angle_rad(T_a_b))))
+
+
 def is_possible_step(
     T_world_before: NDArray[np.float64],
     T_world_camera: NDArray[np.float64],
@@ -49,9 +67,8 @@ def is_possible_step(
     config: VerificationConfig,
 ) -> bool:
     """Whether a camera can have moved so far in so many frames."""
-    step = inverse(T_world_before) @ T_world_camera
-    is_near = float(np.linalg.norm(step[:3, 3])) <= config.max_step_m * frames
-    return is_near and np.degrees(angle_rad(step)) <= config.max_step_deg * frames
+    limit = Step(config.max_step_m * frames, config.max_step_deg * frames)
+    return step_between(T_world_before, T_world_camera).is_within(limit)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -148,3 +148,28 @@ def test_a_truncated_depth_image_is_refused_by_name(room, session):
 
     with pytest.raises(InputError, match="depth.bytes"):
         session.track(dataclasses.replace(frame, depth=cut))
+
+
+CORNER = exp([0.0, 0.0, 0.0, 0.4, 0.8, 0.0])  # two walls and the floor hold all six directions
+
+
+def dark(frame):
+    black = ColourImage(ColourEncoding.RGB8, bytes(len(frame.rgb.bytes)))
+    return dataclasses.replace(frame, rgb=black)
+
+
+def test_in_the_dark_geometry_holds_the_pose_and_says_so(room, session):
+    session.track(room.frame(0, CORNER))
+
+    result = session.track(dark(room.frame(1, CORNER @ path(1))))
+
+    assert result.status is TrackingStatus.COARSE_ONLY
+    assert error(result.T_world_camera, path(1))[0] < 0.002
+
+
+def test_in_the_dark_a_leap_is_not_believed(room, session):
+    session.track(room.frame(0, CORNER))
+
+    result = session.track(dark(room.frame(1, CORNER @ exp([0.0, 0.0, 0.0, 0.0, 1.6, 0.0]))))
+
+    assert result.status is TrackingStatus.LOST
