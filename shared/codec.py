@@ -194,7 +194,7 @@ def _convert_array(kind: Any, value: Any, where: str) -> np.ndarray:
     if isinstance(value, list):
         try:
             value = np.asarray(value, dtype)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise InputError(where, "must be numbers in rows of equal length") from None
     if not isinstance(value, np.ndarray):
         raise InputError(where, f"must be an array, got {_name(value)}")
@@ -213,10 +213,17 @@ def _convert_enum(kind: type[StrEnum], value: Any, where: str) -> StrEnum:
 
 def _convert_scalar(kind: Any, value: Any, where: str) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return _float(value, where)
     if type(value) is not kind:
         raise InputError(where, f"must be {kind.__name__}, got {_name(value)}")
     return value
+
+
+def _float(value: int, where: str) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError(where, "is too large a number") from None
 
 
 def _name(value: Any) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import Any, TypeVar
 
-from services.gateway.errors import MESSAGE
+from services.gateway.errors import MESSAGE, TooLargeError
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import InputError
@@ -20,6 +20,7 @@ T = TypeVar("T")
 
 MAX_SEQ = 1 << 46  # a landmark's id is its keyframe's seq with 16 more bits
 MAX_T_NS = 1 << 62
+_ROOM = 1 << 16  # of a message, beyond its images
 _TAIL = 64  # an image's end marker may be followed by so many bytes of padding
 _PNG = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB, _RGBA = 0, 2, 6
@@ -31,11 +32,22 @@ def read_frame(data: bytes, calibration: Calibration) -> FrameMessage:
     """A checked frame from a msgpack message.
 
     Raises:
+        TooLargeError: it is longer than its images could be without any compression. Other
+            content would cost 70 times its size as Python values.
         InputError: names the field.
     """
+    limit = _max_bytes(calibration)
+    if len(data) > limit:
+        raise TooLargeError(MESSAGE, f"must be at most {limit} bytes for this calibration")
     message = named_from(FrameMessage, codec.unpack, data)
     check_frame(message, calibration)
     return message
+
+
+def _max_bytes(calibration: Calibration) -> int:
+    colour, depth = calibration.colour.intrinsics, calibration.depth_camera().intrinsics
+    raw = 3 * colour.width * colour.height + 2 * depth.width * depth.height
+    return raw + raw // 8 + _ROOM  # PNGs of noise are a little longer than its pixels
 
 
 def plain(kind: type[T], value: Any) -> T:

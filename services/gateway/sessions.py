@@ -171,11 +171,13 @@ class Sessions:
         return choose(name, loads, self.fabric.config.dispatch.load_cap)
 
     async def _mapper_of(self, name: str) -> str | None:
+        """The mapper that has the session open, or else one whose disk holds it."""
+        found = None
         for mapper in sorted(self.fabric.mappers.names):
-            summaries = (await self._list_of(mapper)).sessions
-            if any(summary.session == name for summary in summaries):
-                return mapper
-        return None
+            for summary in (await self._list_of(mapper)).sessions:
+                if summary.session == name and (found is None or summary.is_open):
+                    found = mapper
+        return found
 
     async def _list_of(self, mapper: str) -> SessionList:
         timeout_s = self.fabric.config.mapping.question_timeout_s

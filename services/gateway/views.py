@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.gateway.decode import plain
+from services.gateway.decode import MAX_T_NS, plain
 from shared import codec, images
-from shared.camera import Intrinsics
+from shared.camera import MAX_IMAGE_SIDE_PX, Intrinsics
 from shared.errors import InputError
 from shared.maps import RenderReply, RenderRequest
 from shared.se3 import Pose, Quaternion, Vector3
@@ -34,6 +34,8 @@ class View:
         """Refuse what cannot be rendered with an InputError that names the field."""
         size = self.request.intrinsics
         size.check("intrinsics")
+        if abs(self.request.appearance_t_ns or 0) >= MAX_T_NS:
+            raise InputError("appearance_t_ns", f"must be less than {MAX_T_NS}")
         if size.width * size.height > max_pixels:
             raise InputError("width", f"width x height must be at most {max_pixels} pixels")
         if self.what not in WHATS:
@@ -85,7 +87,13 @@ def intrinsics_from(
     """The session's colour camera, with what is given put in.
 
     A size without `fx` scales the camera to it.
+
+    Raises:
+        InputError: a side is no size of an image.
     """
+    for name, side in (("width", width), ("height", height)):
+        if side is not None and not 0 < side <= MAX_IMAGE_SIDE_PX:
+            raise InputError(f"intrinsics.{name}", f"must be 1 to {MAX_IMAGE_SIDE_PX} px")
     if lens["fx"] is None and (width or height):
         camera = camera.scaled(width / camera.width if width else (height or 0) / camera.height)
     given = {name: value for name, value in lens.items() if value is not None}

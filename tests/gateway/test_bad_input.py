@@ -274,6 +274,12 @@ def test_a_body_over_the_limit_is_too_large(gateway, offline):
     assert (response.status_code, response.json()["code"]) == (413, "too_large")
 
 
+def test_a_message_longer_than_its_images_can_be_is_too_large(gateway, offline):
+    response = post(gateway, offline, msgpack.packb([{}] * 100_000))
+
+    assert (response.status_code, response.json()["code"]) == (413, "too_large")
+
+
 def test_a_body_that_grows_over_the_limit_is_too_large(gateway, offline):
     pieces = (bytes(1 << 20) for _ in range(40))
 

@@ -93,6 +93,15 @@ def test_a_field_that_does_not_fit_is_named(changes, field, reason):
     assert caught.value.field == field
 
 
+def test_a_number_beyond_every_float_is_named():
+    plain = codec.to_json(example(np.zeros(2, np.float32))) | {"times": {"x": 10**400}}
+
+    with pytest.raises(InputError, match="too large") as caught:
+        codec.from_plain(Outer, plain)
+
+    assert caught.value.field == "Outer.times.x"
+
+
 def array_bytes(dtype, shape, data):
     return packb(
         {
