@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -10,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from services.gateway import examples
 from services.gateway.decode import plain, read_frame
 from services.gateway.errors import MESSAGE
-from services.gateway.poses import TimedPose, deviations
+from services.gateway.poses import TimedPose
 from services.gateway.sessions import CreateRequest, Sessions
 from services.gateway.trajectory import fetch_trajectory, trajectory_json, trajectory_tum
 from shared import codec
@@ -71,9 +72,11 @@ def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
         return pose_json((await sessions.get(name)).pose(t_ns))
 
     @router.get("/v1/sessions/{name}/trajectory")
-    async def get_trajectory(name: str) -> dict[str, Any]:
+    async def get_trajectory(name: str) -> Response:
         """Every answered frame: status, pose as told, pose in the map as it is now."""
-        return trajectory_json(await fetch_trajectory(await sessions.get(name)))
+        trajectory = await fetch_trajectory(await sessions.get(name))
+        # An hour of frames takes seconds to write; frames go on meanwhile.
+        return await asyncio.to_thread(lambda: JSONResponse(trajectory_json(trajectory)))
 
     @router.get("/v1/sessions/{name}/trajectory.tum")
     async def get_trajectory_tum(
@@ -81,7 +84,8 @@ def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
     ) -> Response:
         """The trajectory as a TUM file (t tx ty tz qx qy qz qw), one line a tracked frame."""
         trajectory = await fetch_trajectory(await sessions.get(name))
-        return Response(trajectory_tum(trajectory, kind), media_type="text/plain")
+        text = await asyncio.to_thread(trajectory_tum, trajectory, kind)
+        return Response(text, media_type="text/plain")
 
 
 def _add_health_routes(router: APIRouter, sessions: Sessions) -> None:
@@ -105,7 +109,7 @@ def _add_health_routes(router: APIRouter, sessions: Sessions) -> None:
 
 def pose_json(pose: TimedPose) -> dict[str, Any]:
     """A pose as plain JSON values, with named quaternion fields."""
-    deviation = deviations(pose.covariance)
+    deviation = pose.deviations()
     return {
         "seq": pose.seq,
         "t_ns": pose.t_ns,

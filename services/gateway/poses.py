@@ -50,6 +50,10 @@ class TimedPose:
     map_revision: int
     is_interpolated: bool = False
 
+    def deviations(self) -> tuple[float, float] | None:
+        """Of position (metres) and rotation (degrees); None where the camera was lost."""
+        return deviations(self.covariance) if self.status in HAS_POSE else None
+
 
 class PoseRing:
     """The last `size` answered frames of a session, by time."""

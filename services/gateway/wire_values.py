@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.gateway.poses import TimedPose, deviations
+from services.gateway.poses import TimedPose
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.errors import InputError
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
@@ -160,7 +160,7 @@ def reply_to(reply: FrameReply) -> tracking_service_pb2.TrackFramesResponse:
 
 def timed_pose_to(pose: TimedPose) -> pose_service_pb2.TimedPose:
     """A pose at a time."""
-    deviation = deviations(pose.covariance)
+    deviation = pose.deviations()
     return pose_service_pb2.TimedPose(
         seq=pose.seq,
         t_ns=pose.t_ns,

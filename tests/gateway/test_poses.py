@@ -59,6 +59,14 @@ def test_lost_frames_are_not_interpolated_from(ring):
         ring.at(4 * SECOND + 5, NO_CORRECTION)
 
 
+def test_only_a_tracked_pose_has_a_deviation(ring):
+    tracked = ring.last(NO_CORRECTION).deviations()
+    ring.add(record(5, [9, 9, 9, 0, 0, 0], TrackingStatus.LOST), map_revision=3)
+
+    assert tracked is not None
+    assert ring.last(NO_CORRECTION).deviations() is None
+
+
 def test_the_oldest_pose_makes_room(ring):
     for seq in range(5, 15):
         ring.add(record(seq, np.zeros(6)), map_revision=3)
