@@ -106,8 +106,9 @@ def run_sequence(options: RunOptions) -> dict[str, Any]:
     with _gateway(options, folder) as gateway, Client(gateway.url) as client:
         session = client.create_session(sequence.calibration, mode=options.mode, seed=options.seed)
         streamed, mapped = _stream_and_map(session, sequence, options)
-        export_map(session, folder)
         record = _record(options, sequence, session, streamed)
+        folder.write_record(record)
+        export_map(session, folder)
         with progress_bar("scores", "view") as progress:
             evaluation = evaluate_session(session, sequence, options.holdout, folder, progress)
         metrics = {
@@ -118,7 +119,6 @@ def run_sequence(options: RunOptions) -> dict[str, Any]:
             "peak_rss_mb": entries.memory_entry(gateway.peak_rss_mb()),
             **entries.provenance(),
         }
-    folder.write_record(record)
     write_evaluation(folder, sequence, record, evaluation, metrics)
     return metrics
 
@@ -175,12 +175,18 @@ def _gateway(options: RunOptions, folder: RunFolder) -> Iterator[Gateway]:
 
 
 def prepare_folder(path: Path) -> RunFolder:
-    """The output folder without what an earlier run left there."""
+    """The output folder without what an earlier run left there.
+
+    Raises:
+        ConfigError: it cannot be made, or holds folders that would be removed and are no run's.
+    """
     folder = RunFolder(path)
     for old in (folder.renders, folder.map):
-        shutil.rmtree(old, ignore_errors=True)
-    for old in (folder.metrics, folder.report, folder.ply):
-        old.unlink(missing_ok=True)
+        if old.exists() and not (folder.is_run() or folder.logs.is_dir()):
+            raise ConfigError(
+                f"--out {path}: {old.name}/ there is of no run; choose another folder"
+            )
+    folder.clear()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

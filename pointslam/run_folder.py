@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,14 @@ class RunFolder:
     def is_run(self) -> bool:
         """Whether a run was written here."""
         return self._record.is_file()
+
+    def clear(self) -> None:
+        """Remove what a run wrote, except its logs."""
+        for folder in (self.renders, self.map):
+            shutil.rmtree(folder, ignore_errors=True)
+        trajectories = (self.trajectory("online"), self.trajectory("final"))
+        for file in (self._record, self.metrics, self.report, self.ply, *trajectories):
+            file.unlink(missing_ok=True)
 
     def write_record(self, record: RunRecord) -> None:
         """Keep how the run was made."""
