@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from services.mapping.entries import check_entry
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
 from services.mapping.log import SessionLog, read_log
 from services.mapping.map_state import MapState
 from services.mapping.pipeline import NewKeyframe
 from services.mapping.snapshot import read_newest
 from services.mapping.storage import SessionFolder
-from shared.errors import ConflictError, InputError
+from shared.errors import ConflictError
 from shared.frames import Frame
 from shared.maps import Trajectory
 from shared.tracks import (
@@ -108,11 +109,11 @@ class Ledger:
         """Log an entry and insert its keyframe; returns what the map must be told.
 
         Raises:
-            InputError: frame and keyframe data do not belong together.
+            InputError: frame and keyframe data do not belong together, or cannot be applied.
             ConflictError: the frame is older than the newest one.
             StorageError: the disk refused; nothing has changed.
         """
-        _check(entry)
+        check_entry(entry)
         with self._lock:
             if self._last is not None and entry.record.seq <= self._last.seq:
                 raise ConflictError(f"frame {entry.record.seq} is not newer than {self._last.seq}")
@@ -165,13 +166,6 @@ class Ledger:
     def close(self) -> None:
         """Close the log."""
         self._log.close()
-
-
-def _check(entry: Advance) -> None:
-    if (entry.frame is None) != (entry.keyframe is None):
-        raise InputError("keyframe", "a keyframe needs both its frame and its data")
-    if entry.frame is not None and entry.frame.seq != entry.record.seq:
-        raise InputError("frame.seq", f"is {entry.frame.seq}, the record's is {entry.record.seq}")
 
 
 def _final_pose(record: FrameRecord, T_world_keyframe: dict[int, np.ndarray]) -> np.ndarray:

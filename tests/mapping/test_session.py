@@ -90,6 +90,16 @@ def test_a_keyframe_without_its_data_is_refused(open_session, entry):
         session.advance(replace(entry(0), keyframe=None))
 
 
+def test_a_keyframe_that_cannot_be_applied_never_reaches_the_log(open_session, entry, tmp_path):
+    session = open_session()
+    good = entry(0)
+    short = replace(good.keyframe, landmark_normals_camera=np.zeros((3, 3), np.float32))
+
+    with pytest.raises(InputError, match="landmark_normals_camera"):
+        session.advance(replace(good, keyframe=short))
+    assert (tmp_path / "room" / "log-000001.bin").stat().st_size == 0
+
+
 def test_a_context_holds_a_keyframe_at_once(open_session, entry):
     session = open_session()
     session.advance(entry(0))

@@ -1,0 +1,65 @@
+"""What an entry must be before it is logged: one that cannot be applied would end every replay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import InputError
+from shared.tracks import Advance, FrameRecord, KeyframeData
+
+_Shaped = Mapping[str, tuple[NDArray, tuple[int, ...]]]
+
+
+def check_entry(entry: Advance) -> None:
+    """Refuse frame and keyframe data that do not belong together or have impossible shapes.
+
+    Raises:
+        InputError: names the field.
+    """
+    if (entry.frame is None) != (entry.keyframe is None):
+        raise InputError("keyframe", "a keyframe needs both its frame and its data")
+    if entry.frame is not None and entry.frame.seq != entry.record.seq:
+        raise InputError("frame.seq", f"is {entry.frame.seq}, the record's is {entry.record.seq}")
+    _check_shapes("record", _shapes_of_record(entry.record))
+    if entry.keyframe is not None:
+        _check_shapes("keyframe", _shapes_of_keyframe(entry.keyframe))
+
+
+def _check_shapes(where: str, arrays: _Shaped) -> None:
+    for name, (array, shape) in arrays.items():
+        if array.shape != shape:
+            raise InputError(f"{where}.{name}", f"must have shape {shape}, got {array.shape}")
+        if shape[-2:] == (4, 4) and not np.isfinite(array).all():
+            raise InputError(f"{where}.{name}", "must be finite")
+
+
+def _shapes_of_record(record: FrameRecord) -> _Shaped:
+    return {
+        "T_reference_camera": (record.T_reference_camera, (4, 4)),
+        "T_world_camera": (record.T_world_camera, (4, 4)),
+        "covariance": (record.covariance, (6, 6)),
+    }
+
+
+def _shapes_of_keyframe(data: KeyframeData) -> _Shaped:
+    seen, moved, cloud = data.observations, data.correction, data.cloud_camera
+    features, points = seen.landmark_ids.size, cloud.points.size // 3
+    poses, landmarks = moved.keyframe_seqs.size, moved.landmark_ids.size
+    return {
+        "observations.landmark_ids": (seen.landmark_ids, (features,)),
+        "observations.keypoints_px": (seen.keypoints_px, (features, 2)),
+        "observations.octaves": (seen.octaves, (features,)),
+        "observations.depths_m": (seen.depths_m, (features,)),
+        "observations.descriptors": (seen.descriptors, (features, 32)),
+        "landmark_normals_camera": (data.landmark_normals_camera, (features, 3)),
+        "cloud_camera.points": (cloud.points, (points, 3)),
+        "cloud_camera.normals": (cloud.normals, (points, 3)),
+        "thumbnail": (data.thumbnail, (15, 20)),
+        "correction.keyframe_seqs": (moved.keyframe_seqs, (poses,)),
+        "correction.T_world_keyframes": (moved.T_world_keyframes, (poses, 4, 4)),
+        "correction.landmark_ids": (moved.landmark_ids, (landmarks,)),
+        "correction.positions_world": (moved.positions_world, (landmarks, 3)),
+    }
