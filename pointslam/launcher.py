@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pointslam.process import Command, ServiceProcess
 from pointslam.settings import ServiceSettings
+from shared.errors import ConfigError
 
 START_TIMEOUT_S = 300.0  # the first start compiles every kernel
 _STOP_TIMEOUT_S = 20.0
@@ -27,6 +28,13 @@ class LaunchOptions:
     http_port: int = 0
     grpc_port: int = 0
     settings: ServiceSettings = field(default_factory=ServiceSettings)
+
+    def __post_init__(self) -> None:
+        if self.num_trackers < 1:
+            raise ConfigError(f"at least 1 tracker is needed, got {self.num_trackers}")
+        for name, port in (("http_port", self.http_port), ("grpc_port", self.grpc_port)):
+            if not 0 <= port <= 65535:
+                raise ConfigError(f"{name} must be 0 to 65535, got {port}")
 
 
 class Services:

@@ -30,9 +30,9 @@ class Row:
 def table_rows(metrics: dict[str, Any]) -> list[Row]:
     """The figures that people look at first; `-` where there is none."""
     wall, anchors = metrics["wall_s"], metrics["anchors"]
-    superseded = metrics["frames"] - metrics["tracked"] - metrics["lost"]
+    unanswered = metrics["frames"] - metrics["tracked"] - metrics["lost"]  # superseded, too early
     counts = f"{metrics['tracked']} of {metrics['frames']}, {metrics['lost']} lost"
-    counts += f", {superseded} superseded" if superseded else ""
+    counts += f", {unanswered} without an answer" if unanswered else ""
     rows = [
         Row("sequence", f"{metrics['sequence']} ({metrics['mode']})"),
         Row("frames tracked", f"{counts}, {metrics['relocalized']} relocalized"),
