@@ -9,17 +9,22 @@ from __future__ import annotations
 import struct
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from services.gateway.errors import MESSAGE, TooLargeError
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import InputError
 from shared.frames import ColourEncoding, DepthEncoding
+from shared.se3 import Pose
 from shared.stream import FLAGS, FrameMessage
 
 T = TypeVar("T")
 
 MAX_SEQ = 1 << 46  # a landmark's id is its keyframe's seq with 16 more bits
 MAX_T_NS = 1 << 62
+MAX_POSITION_M = 1e4  # points of a map are float32: a millimetre there
 _ROOM = 1 << 16  # of a message, beyond its images
 _TAIL = 64  # an image's end marker may be followed by so many bytes of padding
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -81,7 +86,7 @@ def check_frame(message: FrameMessage, calibration: Calibration) -> None:
             "depth.scale", f"is {scale}, the calibration says {calibration.depth_scale}"
         )
     if message.prior is not None:
-        _check_pose(message)
+        matrix_of(message.prior.T_odom_camera, "prior.T_odom_camera")
     _check_colour(message.rgb.encoding, message.rgb.bytes, calibration.colour.intrinsics)
     size = calibration.depth_camera().intrinsics
     _check_depth(message.depth.encoding, message.depth.bytes, size)
@@ -92,12 +97,21 @@ def _check_range(field: str, value: int, limit: int) -> None:
         raise InputError(field, f"must be 0 to {limit - 1}, got {value}")
 
 
-def _check_pose(message: FrameMessage) -> None:
-    assert message.prior is not None
+def matrix_of(pose: Pose, field: str) -> NDArray[np.float64]:
+    """A client's pose as a matrix, [4, 4].
+
+    Raises:
+        InputError: it is no pose, or too far from the origin; names the field.
+    """
     try:
-        message.prior.T_odom_camera.matrix()
+        T = pose.matrix()
     except InputError as error:
-        raise InputError(f"prior.T_odom_camera.{error.field}", error.reason) from None
+        raise InputError(f"{field}.{error.field}", error.reason) from None
+    if np.abs(T[:3, 3]).max() > MAX_POSITION_M:
+        raise InputError(
+            f"{field}.position", f"must be within {MAX_POSITION_M:.0f} m of the origin"
+        )
+    return T
 
 
 def _check_colour(encoding: ColourEncoding, data: bytes, size: Intrinsics) -> None:

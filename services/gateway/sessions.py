@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from services.gateway.decode import matrix_of
 from services.gateway.dispatch import choose
 from services.gateway.owner import Fabric, ask_open
 from services.gateway.session import Session
@@ -56,10 +57,7 @@ class CreateRequest:
         """The pose of the first frame, [4, 4]."""
         if self.T_map_first is None:
             return np.eye(4)
-        try:
-            return self.T_map_first.matrix()
-        except InputError as error:
-            raise InputError(f"T_map_first.{error.field}", error.reason) from None
+        return matrix_of(self.T_map_first, "T_map_first")
 
 
 @dataclass
