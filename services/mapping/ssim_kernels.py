@@ -10,14 +10,14 @@ from torch import Tensor
 
 from services.mapping.rasterizer.lanes import lane
 from services.mapping.rasterizer.memory import fetch_add, load, store
-from services.mapping.rasterizer.simd import inlined, kernel, ramp, select, splat
+from services.mapping.rasterizer.simd import LANES, allocating, inlined, kernel, ramp, select, splat
 
 _RADIUS = 5
 _WINDOW = np.exp(-(np.arange(-_RADIUS, _RADIUS + 1) ** 2) / (2 * 1.5**2))
 _TAPS = tuple(np.float32(tap) for tap in _WINDOW / _WINDOW.sum())
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
-_MARGIN = 8  # zeros left and right of each row, so that strips may read past the border
+_MARGIN = LANES  # zeros left and right of each row, so that strips may read past the border
 
 
 class Layout(NamedTuple):
@@ -30,7 +30,7 @@ class Layout(NamedTuple):
     @staticmethod
     def of(image: Tensor) -> Layout:
         height, width, _ = image.shape
-        return Layout(height, width, -(-width // 8) * 8 + 2 * _MARGIN)
+        return Layout(height, width, -(-width // LANES) * LANES + 2 * _MARGIN)
 
     def planes(self) -> NDArray[np.float32]:
         return np.empty(3 * self.height * self.stride, np.float32)
@@ -68,7 +68,7 @@ def pack(image, planes, layout, counter):
 
 @inlined
 def _across(row, x):
-    """Horizontal blur of 8 columns: 11 symmetric taps around column x."""
+    """Horizontal blur of LANES columns: 11 symmetric taps around column x."""
     total = load(row, x) * _TAPS[5]
     total = total + (load(row, x - 1) + load(row, x + 1)) * _TAPS[4]
     total = total + (load(row, x - 2) + load(row, x + 2)) * _TAPS[3]
@@ -83,7 +83,7 @@ def _taps_inside(y, height):
     return max(0, _RADIUS - y), min(2 * _RADIUS + 1, height + _RADIUS - y)
 
 
-@inlined
+@allocating
 def _rows(stride):
     """Three rows for the vertical blurs."""
     return np.zeros(stride, np.float32), np.zeros(stride, np.float32), np.zeros(stride, np.float32)
@@ -102,7 +102,7 @@ def blur_target(target, layout, counter):
         for channel in range(3):
             row = (channel * height + y) * stride
             _blur_down(pixels, pixels, (row, y), layout, (down, down_square, down_square))
-            for x in range(_MARGIN, width + _MARGIN, 8):
+            for x in range(_MARGIN, width + _MARGIN, LANES):
                 store(means, row + x, _across(down, x))
                 store(squares, row + x, _across(down_square, x))
 
@@ -113,7 +113,7 @@ def _blur_down(a, b, place, layout, rows):
     row, y = place
     down, down_square, down_product = rows
     first, last = _taps_inside(y, layout.height)
-    for x in range(0, layout.stride, 8):
+    for x in range(0, layout.stride, LANES):
         mean, square, product = splat(_ZERO), splat(_ZERO), splat(_ZERO)
         for tap in range(first, last):
             source = row + (tap - _RADIUS) * layout.stride + x
@@ -141,10 +141,10 @@ def compare(image, comparison, layout, row_sums, counter):
             _blur_down(image, target.pixels, (row, y), layout, rows)
             _clear_margins(slopes, row, layout.stride)
             total = splat(_ZERO)
-            for x in range(_MARGIN, layout.width + _MARGIN, 8):
+            for x in range(_MARGIN, layout.width + _MARGIN, LANES):
                 inside = ramp() + np.float32(x - _MARGIN) < np.float32(layout.width)
                 total = total + _compare_strip(rows, target, slopes, (row, x), inside)
-            for i in range(8):
+            for i in range(LANES):
                 row_sums[y] += lane(total, i)
 
 
@@ -157,7 +157,7 @@ def _clear_margins(slopes, row, stride):
 
 @inlined
 def _compare_strip(rows, target, slopes, place, inside):
-    """SSIM of 8 pixels, zero outside the image; notes the slopes."""
+    """SSIM of LANES pixels, zero outside the image; notes the slopes."""
     row, x = place
     mean, square, product = _across(rows[0], x), _across(rows[1], x), _across(rows[2], x)
     target_mean, target_square = load(target.means, row + x), load(target.squares, row + x)
@@ -191,7 +191,7 @@ def spread_back(sources, layout, scale, result, counter):
         for channel in range(3):
             row = (channel * height + y) * stride
             _blur_slopes_down(slopes, (row, y), layout, rows)
-            for x in range(_MARGIN, width + _MARGIN, 8):
+            for x in range(_MARGIN, width + _MARGIN, LANES):
                 store(line, x, _spread_strip(rows, images, (row, x)) * scale)
             for x in range(width):
                 result[(y * width + x) * 3 + channel] = line[_MARGIN + x]
@@ -201,7 +201,7 @@ def spread_back(sources, layout, scale, result, counter):
 def _blur_slopes_down(slopes, place, layout, rows):
     row, y = place
     first, last = _taps_inside(y, layout.height)
-    for x in range(0, layout.stride, 8):
+    for x in range(0, layout.stride, LANES):
         mean, square, product = splat(_ZERO), splat(_ZERO), splat(_ZERO)
         for tap in range(first, last):
             source = row + (tap - _RADIUS) * layout.stride + x

@@ -4,9 +4,18 @@ import numpy as np
 import pytest
 
 from services.mapping.rasterizer.binning import bin_gaussians, sort_keys
-from services.mapping.rasterizer.kernel_types import RECORD, TILE, Camera, Projected, Splats
+from services.mapping.rasterizer.kernel_types import (
+    REACH,
+    RECORD,
+    TILE,
+    Camera,
+    Projected,
+    Splats,
+    TileLists,
+)
 from services.mapping.rasterizer.projection import project
 from services.mapping.rasterizer.scene import View
+from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import kernel
 from services.mapping.rasterizer.threads import workers
 from shared.camera import Intrinsics
@@ -29,9 +38,20 @@ def _projected(count, seed=0):
         rng.uniform(0.01, 1, count).astype(np.float32),
         rng.uniform(0, 1, count * 3).astype(np.float32),
     )
-    projected = Projected.empty(count)
+    projected = Projected.empty(count, CAMERA.tiles(), Scratch())
     workers(1).run(project, splats, CAMERA, projected)
     return projected
+
+
+def _boxes(projected):
+    """First and last column, first and last row of every Gaussian, [4, N]."""
+    return projected.boxes.reshape(4, -1)
+
+
+def _owners(lists: TileLists, tile):
+    """The Gaussians of a tile's list."""
+    keys = lists.keys[lists.tile_starts[tile] : lists.tile_starts[tile + 1]]
+    return lists.owners[(keys & np.uint64(0xFFFFFFFF)).astype(np.int64)]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 47, 48, 500, 5000])
@@ -51,37 +71,37 @@ def test_every_pixel_within_an_ellipse_lies_in_a_listed_tile():
     projected = _projected(300)
     records = projected.records.reshape(-1, RECORD)
 
-    lists = bin_gaussians(projected, CAMERA, workers(2))
+    lists = bin_gaussians(projected, CAMERA, workers(2), Scratch())
 
     columns = -(-CAMERA.width // TILE)
     listed = {
-        (int(gaussian), tile)
-        for tile in range(CAMERA.tiles())
-        for gaussian in lists.unsorted[lists.tile_starts[tile] : lists.tile_starts[tile + 1]]
+        (int(gaussian), tile) for tile in range(CAMERA.tiles()) for gaussian in _owners(lists, tile)
     }
     y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
-    for index in np.nonzero(projected.counts)[0]:
+    for index in np.nonzero(np.diff(lists.starts))[0]:
         mean_x, mean_y, e1, shear, e2, *_ = records[index].astype(np.float64)
         dx, dy = x + 0.5 - mean_x, y + 0.5 - mean_y
         exponent = (e1 * dx) ** 2 + (e2 * (dy - shear * dx)) ** 2
-        inside = exponent < records[index, 12] * (1 - 1e-4)
+        inside = exponent < records[index, REACH] * (1 - 1e-4)
         tiles = set(((y // TILE) * columns + x // TILE)[inside].tolist())
         assert {(int(index), tile) for tile in tiles} <= listed
 
 
-def test_slots_lead_each_gaussian_to_its_own_pairs():
+def test_the_slots_of_a_gaussian_lie_side_by_side_and_each_is_listed_once():
     projected = _projected(5000)
 
-    lists = bin_gaussians(projected, CAMERA, workers(2))
+    lists = bin_gaussians(projected, CAMERA, workers(2), Scratch())
 
-    owners = np.repeat(np.arange(5000), np.diff(lists.starts))
-    np.testing.assert_array_equal(lists.unsorted[lists.slots], owners)
-    assert sorted(lists.slots) == list(range(len(lists.slots)))
+    np.testing.assert_array_equal(lists.owners, np.repeat(np.arange(5000), np.diff(lists.starts)))
+    slots = lists.keys & np.uint64(0xFFFFFFFF)
+    np.testing.assert_array_equal(np.sort(slots), np.arange(len(slots)))
 
 
 def test_thin_gaussians_skip_the_tiles_of_their_box_that_they_miss():
     projected = _projected(5000)
 
-    lists = bin_gaussians(projected, CAMERA, workers(1))
+    lists = bin_gaussians(projected, CAMERA, workers(1), Scratch())
 
-    assert len(lists.slots) < projected.counts.sum()
+    left, right, top, bottom = _boxes(projected)[:, :5000]
+    boxed = (right - left + 1).clip(0) * (bottom - top + 1).clip(0)
+    assert len(lists.owners) < boxed.sum()

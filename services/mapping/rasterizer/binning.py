@@ -1,7 +1,8 @@
 """Binning: which Gaussians touch which tile, listed in order of their index.
 
-Two passes over chunks of Gaussians, a count and a scatter, with prefix sums between. The lists do
-not depend on the number of threads because the chunks do not. Each tile sorts its own list.
+The projection counted the hits of each chunk of Gaussians in each tile; prefix sums over them
+tell every chunk where to write. The lists do not depend on the number of threads because the
+chunks do not. Each tile sorts its own list.
 """
 
 from __future__ import annotations
@@ -11,157 +12,89 @@ import numpy as np
 from services.mapping.rasterizer.kernel_types import (
     CHUNK,
     DEPTH,
-    E1,
-    E2,
-    MEAN_X,
-    MEAN_Y,
-    REACH,
     RECORD,
-    SHEAR,
-    SLANT,
     TILE,
     Camera,
     Projected,
     TileLists,
 )
 from services.mapping.rasterizer.memory import fetch_add
+from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import inlined, kernel
 from services.mapping.rasterizer.threads import Workers
-
-_HALF, _ZERO = np.float32(0.5), np.float32(0.0)
-_TILE_SIDE = np.float32(TILE - 1)  # between the centres of its first and last pixel
+from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row
 
 
-def bin_gaussians(projected: Projected, camera: Camera, pool: Workers) -> TileLists:
+def bin_gaussians(
+    projected: Projected, camera: Camera, pool: Workers, scratch: Scratch
+) -> TileLists:
     """List the Gaussians of every tile; the lists still lack their order by depth."""
-    count, tiles = len(projected.counts), camera.tiles()
-    chunks = -(-count // CHUNK)
-    histograms = np.zeros((chunks, tiles), np.int32)
-    totals = np.zeros(chunks, np.int64)
+    chunks, tiles = projected.hits.shape
     tile_starts = np.empty(tiles + 1, np.int32)
-    pool.run(_count_hits, projected, camera.width, histograms, totals)
-    pairs = _prefix_sums(histograms, totals, tile_starts)
+    slots = np.empty(chunks, np.int64)
+    pairs = _prefix_sums(projected.hits, slots, tile_starts)
     lists = TileLists(
         tile_starts=tile_starts,
         tile_ends=np.empty(tiles, np.int32),
-        starts=np.zeros(count + 1, np.int32),
-        slots=np.empty(pairs, np.int32),
-        unsorted=np.empty(pairs, np.int32),
-        keys=np.empty(pairs, np.uint64),
-        gaussians=np.empty(pairs, np.int32),
-        ranks=np.empty(pairs, np.int32),
+        keys=scratch.borrow(pairs, np.uint64),
+        starts=scratch.borrow(projected.num_gaussians + 1, np.int32),
+        owners=scratch.borrow(pairs, np.int32),
     )
-    pool.run(_scatter, projected, camera.width, (histograms, totals), lists)
+    lists.starts[-1] = pairs
+    pool.run(_scatter, projected, camera.width, slots, lists)
     return lists
 
 
-@inlined
-def _squared_distance(records, r, dx, dy):
-    """The exponent / 8 at an offset from the mean."""
-    e1 = dx * records[r + E1]
-    e2 = (dy - records[r + SHEAR] * dx) * records[r + E2]
-    return e1 * e1 + e2 * e2
-
-
-@inlined
-def _hits_tile(records, i, column, row):
-    """Whether the ellipse reaches the centre of any pixel of a tile (as a continuous box)."""
-    r = i * RECORD
-    left = np.float32(column * TILE) + _HALF - records[r + MEAN_X]
-    top = np.float32(row * TILE) + _HALF - records[r + MEAN_Y]
-    right, bottom = left + _TILE_SIDE, top + _TILE_SIDE
-    dx, dy = min(max(_ZERO, left), right), min(max(_ZERO, top), bottom)
-    if dx == _ZERO and dy == _ZERO:
-        return True
-    reach = records[r + REACH]
-    # The nearest point of the box lies on an edge that faces the mean.
-    if dx != _ZERO:
-        y = min(max(records[r + SHEAR] * dx, top), bottom)
-        if _squared_distance(records, r, dx, y) <= reach:
-            return True
-    if dy != _ZERO:
-        x = min(max(records[r + SLANT] * dy, left), right)
-        return _squared_distance(records, r, x, dy) <= reach
-    return False
-
-
-@inlined
-def _box(boxes, i):
-    return boxes[i * 4], boxes[i * 4 + 1], boxes[i * 4 + 2], boxes[i * 4 + 3]
-
-
 @kernel
-def _count_hits(projected, width, histograms, totals, counter):
-    """Count the tiles that each chunk's Gaussians hit, tile by tile and in all."""
-    columns = (width + TILE - 1) // TILE
-    while True:
-        chunk = fetch_add(counter, 0, 1)
-        start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, len(projected.counts))
-        if start >= stop:
-            return
-        for i in range(start, stop):
-            single = projected.counts[i] == 1
-            if projected.counts[i] == 0:
-                continue
-            left, right, top, bottom = _box(projected.boxes, i)
-            for row in range(top, bottom + 1):
-                for column in range(left, right + 1):
-                    if single or _hits_tile(projected.records, i, column, row):
-                        histograms[chunk, row * columns + column] += 1
-                        totals[chunk] += 1
+def _prefix_sums(hits, slots, tile_starts):
+    """Turn counts into first places, in place, and find each chunk's first slot.
 
-
-@kernel
-def _prefix_sums(histograms, totals, tile_starts):
-    """Turn counts into first places, in place; gives the number of pairs."""
+    Gives the number of pairs.
+    """
+    chunks, tiles = hits.shape
+    slots[:] = 0
     place = 0
-    for tile in range(histograms.shape[1]):
+    for tile in range(tiles):
         tile_starts[tile] = place
-        for chunk in range(histograms.shape[0]):
-            hits = histograms[chunk, tile]
-            histograms[chunk, tile] = place
-            place += hits
-    tile_starts[histograms.shape[1]] = place
+        for chunk in range(chunks):
+            count = hits[chunk, tile]
+            hits[chunk, tile] = place
+            place += count
+            slots[chunk] += count
+    tile_starts[tiles] = place
     first = 0
-    for chunk in range(len(totals)):
-        hits = totals[chunk]
-        totals[chunk] = first
-        first += hits
+    for chunk in range(chunks):
+        count = slots[chunk]
+        slots[chunk] = first
+        first += count
     return place
 
 
 @kernel
-def _scatter(projected, width, places, lists, counter):
-    """Write every pair to its tile's list, and note for each Gaussian where its pairs went."""
-    columns = (width + TILE - 1) // TILE
-    histograms, totals = places
+def _scatter(projected, width, slots, lists, counter):
+    """Write every pair to its tile's list, and each Gaussian's slots, a chunk per count."""
+    columns, total = (width + TILE - 1) // TILE, projected.num_gaussians
     depth_bits = projected.records.view(np.uint32)
-    count = len(projected.counts)
     while True:
         chunk = fetch_add(counter, 0, 1)
-        start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, count)
+        start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, total)
         if start >= stop:
             return
-        slot = totals[chunk]
+        slot, places = slots[chunk], projected.hits[chunk]
         for i in range(start, stop):
             lists.starts[i] = slot
-            single = projected.counts[i] == 1
-            if projected.counts[i] == 0:
-                continue
             depth = np.uint64(depth_bits[i * RECORD + DEPTH]) << np.uint64(32)
-            left, right, top, bottom = _box(projected.boxes, i)
+            left, right, top, bottom = tile_box(projected.boxes, i)
             for row in range(top, bottom + 1):
-                for column in range(left, right + 1):
-                    if single or _hits_tile(projected.records, i, column, row):
-                        tile = row * columns + column
-                        place = histograms[chunk, tile]
-                        histograms[chunk, tile] = place + 1
-                        lists.unsorted[place] = i
-                        lists.keys[place] = depth | np.uint64(place - lists.tile_starts[tile])
-                        lists.slots[slot] = place
-                        slot += 1
-        if stop == count:
-            lists.starts[count] = slot
+                first, last = left, right
+                if left < right and top < bottom:
+                    first, last = tiles_of_row(projected.records, i, row, left, right)
+                for column in range(first, last + 1):
+                    place = places[row * columns + column]
+                    places[row * columns + column] = place + 1
+                    lists.keys[place] = depth | np.uint64(slot)
+                    lists.owners[slot] = i
+                    slot += 1
 
 
 @inlined
@@ -221,4 +154,5 @@ def sort_keys(keys, spare, histograms):
             source, target = target, source
             swapped = not swapped
     if swapped:
-        keys[:] = source
+        for i in range(count):
+            keys[i] = spare[i]

@@ -25,6 +25,7 @@ from services.mapping.rasterizer.projection import project
 from services.mapping.rasterizer.projection_backward import Gradients, Pairs, project_backward
 from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
 from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import Workers, default_threads, workers
 from services.mapping.rasterizer.tiles_backward import blend_tiles_backward
 from services.mapping.rasterizer.tiles_forward import Images, blend_tiles
@@ -76,25 +77,27 @@ class _Engine:
     def prepare(self, gaussians: Gaussians, view: View) -> _Frame:
         camera = Camera.of(view)
         splats = Splats(*(_flat(tensor) for tensor in gaussians.tensors()))
-        projected = Projected.empty(len(splats.opacities))
+        projected = Projected.empty(len(splats.opacities), camera.tiles(), self.scratch)
         self.pool.run(project, splats, camera, projected)
         if not projected.valid.all():
             gaussians.check_finite()
-        return _Frame(splats, camera, projected, bin_gaussians(projected, camera, self.pool))
+        lists = bin_gaussians(projected, camera, self.pool, self.scratch)
+        return _Frame(splats, camera, projected, lists)
 
     def blend(self, frame: _Frame) -> tuple[Tensor, Tensor, Tensor]:
-        size = frame.camera.height, frame.camera.width
-        images = torch.empty(*size, 3), torch.empty(size), torch.empty(size)
-        self.pool.run(blend_tiles, frame.tiles(), _images(images))
-        return images
+        height, width = frame.camera.height, frame.camera.width
+        borrow, pixels = self.scratch.borrow, height * width
+        images = Images(borrow(3 * pixels), borrow(pixels), borrow(pixels))
+        self.pool.run(blend_tiles, frame.tiles(), images)
+        colour, depth, alpha = (torch.from_numpy(image) for image in images)
+        return colour.view(height, width, 3), depth.view(height, width), alpha.view(height, width)
 
     def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
-        lists, records = frame.lists, frame.projected.records
-        result = _empty_gradients(len(frame.splats.opacities))
-        with self.scratch.borrow(len(lists.slots) * RECORD) as sums:
-            self.pool.run(blend_tiles_backward, frame.tiles(), images, gradients, sums)
-            pairs = Pairs(records, lists.starts, lists.slots, lists.ranks, sums)
-            self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
+        sums = self.scratch.borrow(len(frame.lists.owners) * RECORD)
+        self.pool.run(blend_tiles_backward, frame.tiles(), images, gradients, sums)
+        result = _empty_gradients(frame.projected.num_gaussians, self.scratch)
+        pairs = Pairs(frame.lists.starts, sums)
+        self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
         return result
 
 
@@ -145,14 +148,15 @@ def _images(tensors: tuple[Tensor, ...]) -> Images:
     return Images(*(_flat(tensor) for tensor in tensors))
 
 
-def _empty_gradients(count: int) -> Gradients:
-    sizes = count * 3, count * 3, count * 4, count, count * 3, count
-    arrays = (np.empty(size, np.float32) for size in sizes)
-    return Gradients(*arrays, poses=np.empty((-(-count // CHUNK), 96), np.float32))
+def _empty_gradients(count: int, scratch: Scratch) -> Gradients:
+    """Views of the right size of arrays with room for whole vectors of Gaussians."""
+    padded = -(-count // LANES) * LANES
+    arrays = (scratch.borrow(padded * width)[: count * width] for width in (3, 3, 4, 1, 3, 1))
+    return Gradients(*arrays, poses=np.empty((-(-count // CHUNK), 12 * LANES), np.float32))
 
 
 def _pose_gradient(poses: NDArray[np.float32], dtype: torch.dtype, device: Any) -> Tensor:
     """Sum over chunks and lanes to dL/dT_camera_world, [4, 4]."""
     gradient = np.zeros((4, 4))
-    gradient[:3] = poses.reshape(-1, 12, 8).sum(axis=(0, 2), dtype=np.float64).reshape(3, 4)
+    gradient[:3] = poses.reshape(-1, 12, LANES).sum(axis=(0, 2), dtype=np.float64).reshape(3, 4)
     return torch.from_numpy(gradient).to(device, dtype)

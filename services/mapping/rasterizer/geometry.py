@@ -1,4 +1,4 @@
-"""The part of the projection that forward and backward share, 8 Gaussians at a time.
+"""The part of the projection that forward and backward share, LANES Gaussians at a time.
 
 EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 4).
 """
@@ -7,22 +7,34 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from services.mapping.rasterizer.kernel_types import Splats
 from services.mapping.rasterizer.memory import load
-from services.mapping.rasterizer.simd import inlined, maximum, minimum, square_root
+from services.mapping.rasterizer.scene import DILATION_PX2
+from services.mapping.rasterizer.shuffles import load_four, load_three
+from services.mapping.rasterizer.simd import (
+    LANES,
+    allocating,
+    inlined,
+    maximum,
+    minimum,
+    square_root,
+)
 from services.mapping.rasterizer.vectors import (
     combined,
+    cross,
     dot,
     product,
     rotation_columns,
 )
 
-# Rows of 8 lanes in the scratch array of a block: mean, scale, quaternion, opacity.
-_SCALE_ROW, _QUAT_ROW, OPACITY_ROW = 3, 6, 10
-BLOCK_ROWS = 11
+_DILATION, _DILATION_SQUARED = np.float32(DILATION_PX2), np.float32(DILATION_PX2**2)
+_QUARTER = np.float32(0.25)
 
 
 class Block(NamedTuple):
-    """8 Gaussians; every number is a vector of lanes."""
+    """LANES Gaussians; every number is a vector of lanes."""
 
     mean: Any
     scale: Any
@@ -45,33 +57,69 @@ class Ellipses(NamedTuple):
     spread: Any  # `plain` times the scales; covariance = spread spread^T
 
 
-@inlined
-def gather_lane(splats, i, l, lanes):
-    """Put Gaussian `i` into lane `l`."""
-    means, scales, quats, opacities, _ = splats
-    for k in range(3):
-        lanes[k * 8 + l] = means[i * 3 + k]
-        lanes[(_SCALE_ROW + k) * 8 + l] = scales[i * 3 + k]
-    for k in range(4):
-        lanes[(_QUAT_ROW + k) * 8 + l] = quats[i * 4 + k]
-    lanes[OPACITY_ROW * 8 + l] = opacities[i]
+class Shapes(NamedTuple):
+    """Dilated covariances [[a, b], [b, c]] and the factors that whiten them, divided by 4."""
+
+    a: Any
+    b: Any
+    c: Any
+    e1: Any
+    e2: Any
+
+
+@allocating
+def spare_block():
+    """Room for the last Gaussians where they do not fill a vector."""
+    return Splats(
+        np.empty(3 * LANES, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.empty(4 * LANES, np.float32),
+        np.empty(LANES, np.float32),
+        np.empty(3 * LANES, np.float32),
+    )
 
 
 @inlined
-def load_three(lanes, row):
-    """Three rows of lanes."""
-    return load(lanes, row * 8), load(lanes, row * 8 + 8), load(lanes, row * 8 + 16)
+def _copy_rows(source, target, first, width):
+    """Copy LANES rows, or repeat the last one where the source ends."""
+    last = len(source) // width - 1
+    for lane in range(LANES):
+        row = min(first + lane, last)
+        for k in range(width):
+            target[lane * width + k] = source[row * width + k]
+
+
+@allocating
+def whole_block(splats, spare, first):
+    """Arrays that hold LANES Gaussians from `first`, and where: copies at the end of `splats`."""
+    if first + LANES <= len(splats.opacities):
+        return splats, first
+    _copy_rows(splats.means, spare.means, first, 3)
+    _copy_rows(splats.scales, spare.scales, first, 3)
+    _copy_rows(splats.quats, spare.quats, first, 4)
+    _copy_rows(splats.opacities, spare.opacities, first, 1)
+    _copy_rows(splats.colours, spare.colours, first, 3)
+    return spare, 0
 
 
 @inlined
-def load_block(lanes):
-    """The gathered Gaussians as vectors."""
-    w = load(lanes, _QUAT_ROW * 8)
-    x, y, z = load_three(lanes, _QUAT_ROW + 1)
+def load_block(splats, i):
+    """LANES Gaussians from number `i`, as vectors."""
+    return normalised(
+        load_three(splats.means, i * 3),
+        load_three(splats.scales, i * 3),
+        load_four(splats.quats, i * 4),
+        load(splats.opacities, i),
+    )
+
+
+@inlined
+def normalised(mean, scale, quat, opacity):
+    """A block from the fields as given."""
+    w, x, y, z = quat
     quat_scale = 1.0 / square_root(w * w + x * x + y * y + z * z)
-    quat = (w * quat_scale, x * quat_scale, y * quat_scale, z * quat_scale)
-    opacity = load(lanes, OPACITY_ROW * 8)
-    return Block(load_three(lanes, 0), load_three(lanes, _SCALE_ROW), quat, quat_scale, opacity)
+    unit = (w * quat_scale, x * quat_scale, y * quat_scale, z * quat_scale)
+    return Block(mean, scale, unit, quat_scale, opacity)
 
 
 @inlined
@@ -86,7 +134,7 @@ def rotation_rows(pose):
 
 @inlined
 def project_block(block, camera):
-    """Means and covariances on the screen."""
+    """Means, and roots of the covariances without dilation, on the screen."""
     pose, slopes = camera.pose, camera.slopes
     row_x, row_y, row_z = rotation_rows(pose)
     z = dot(block.mean, row_z) + pose[11]
@@ -106,3 +154,15 @@ def project_block(block, camera):
 @inlined
 def _times_columns(row, columns):
     return dot(row, columns[0]), dot(row, columns[1]), dot(row, columns[2])
+
+
+@inlined
+def shapes_of(spread):
+    """The ellipses with these roots of the covariance."""
+    row_x, row_y = spread
+    a, b, c = dot(row_x, row_x), dot(row_x, row_y), dot(row_y, row_y)
+    normal = cross(row_x, row_y)
+    # a c - b^2 by Lagrange's identity: exact zero cannot come out negative for a thin ellipse.
+    determinant = dot(normal, normal) + (a + c) * _DILATION + _DILATION_SQUARED
+    a, c = a + _DILATION, c + _DILATION
+    return Shapes(a, b, c, _QUARTER / square_root(a), square_root(a / determinant) * _QUARTER)

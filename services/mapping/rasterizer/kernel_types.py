@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.rasterizer.scene import ALPHA_MIN, View
+from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.shuffles import RECORD
+from services.mapping.rasterizer.simd import LANES
 
-CHUNK = 4096  # Gaussians in a piece of work
+CHUNK = 4096  # Gaussians in a piece of work; a multiple of LANES
 TILE = 32  # side of a tile, pixels
 
 # A record holds 16 float32 (one cache line) per Gaussian. With d the offset from the projected
@@ -17,7 +20,6 @@ TILE = 32  # side of a tile, pixels
 #     d^T cov^-1 d = d_x^2 / a + (a / det) (d_y - (b / a) d_x)^2 ,
 # which unlike the usual A d_x^2 + 2 B d_x d_y + C d_y^2 does not cancel for thin ellipses.
 # E1 and E2 hold the roots of 1 / a and a / det, times 1/4: kernels want the exponent / 8.
-RECORD = 16
 MEAN_X, MEAN_Y = 0, 1
 E1, SHEAR, E2 = 2, 3, 4  # SHEAR = b / a
 LOG_OPACITY = 5  # ln(opacity) / 8
@@ -72,40 +74,35 @@ class Splats(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Gaussians on the screen."""
+    """Gaussians on the screen; N is their number rounded up to whole vectors."""
 
+    num_gaussians: int
     records: NDArray[np.float32]  # [N * RECORD]
-    boxes: NDArray[np.int16]  # first and last tile column, first and last tile row, [N * 4]
-    counts: NDArray[np.int32]  # tiles in the box, 0 where it is not visible, [N]
+    boxes: NDArray[np.int16]  # first and last tile column, first and last tile row, [4 * N]
+    hits: NDArray[np.int32]  # Gaussians of each chunk that hit each tile, [chunks, tiles]
     valid: NDArray[np.uint8]  # per chunk: every input was finite
 
     @staticmethod
-    def empty(count: int) -> Projected:
+    def empty(count: int, tiles: int, scratch: Scratch) -> Projected:
         """Room for `count` Gaussians."""
-        chunks = -(-count // CHUNK)
+        chunks, padded = -(-count // CHUNK), -(-count // LANES) * LANES
         return Projected(
-            np.empty(count * RECORD, np.float32),
-            np.empty(count * 4, np.int16),
-            np.empty(count, np.int32),
+            count,
+            scratch.borrow(padded * RECORD),
+            scratch.borrow(4 * padded, np.int16),
+            scratch.borrow(chunks * tiles, np.int32).reshape(chunks, tiles),
             np.empty(chunks, np.uint8),
         )
 
 
 class TileLists(NamedTuple):
-    """Which Gaussians touch which tile.
+    """Which Gaussians touch which tile. A slot is a (Gaussian, tile) pair."""
 
-    Slots are (Gaussian, tile) pairs. `starts` bounds each Gaussian's run in `slots`; `slots`
-    gives the pair's place before sorting, `ranks` its place after sorting by depth.
-    """
-
-    tile_starts: NDArray[np.int32]  # [tiles + 1]
+    tile_starts: NDArray[np.int32]  # bounds of each tile in `keys`, [tiles + 1]
     tile_ends: NDArray[np.int32]  # where the tile was full, [tiles]
-    starts: NDArray[np.int32]  # [N + 1]
-    slots: NDArray[np.int32]  # [M], ordered by Gaussian
-    unsorted: NDArray[np.int32]  # Gaussian of each place, ordered by tile, [M]
-    keys: NDArray[np.uint64]  # depth bits and place within the tile, [M]
-    gaussians: NDArray[np.int32]  # Gaussian of each place, ordered by tile and depth, [M]
-    ranks: NDArray[np.int32]  # [M]
+    keys: NDArray[np.uint64]  # bits of the depth, then the slot; a tile's are sorted, [M]
+    starts: NDArray[np.int32]  # bounds of each Gaussian's slots, [N + 1]
+    owners: NDArray[np.int32]  # Gaussian of each slot, [M]
 
 
 class Tiles(NamedTuple):

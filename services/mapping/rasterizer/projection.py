@@ -1,150 +1,158 @@
-"""Forward projection: world Gaussians to records, tile boxes and tile counts."""
+"""Forward projection: world Gaussians to records, tile boxes and counts of hits per tile."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from services.mapping.rasterizer.geometry import (
-    BLOCK_ROWS,
-    gather_lane,
     load_block,
     project_block,
+    shapes_of,
+    spare_block,
+    whole_block,
 )
-from services.mapping.rasterizer.kernel_types import (
-    CHUNK,
-    CUT,
-    DEPTH,
-    E1,
-    E2,
-    HALF_HEIGHT,
-    HALF_WIDTH,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    REACH,
-    RECORD,
-    RED,
-    SHEAR,
-    SLANT,
-    TILE,
+from services.mapping.rasterizer.kernel_types import CHUNK, CUT, RECORD, TILE
+from services.mapping.rasterizer.lanes import all_lanes
+from services.mapping.rasterizer.memory import fetch_add, store_indices
+from services.mapping.rasterizer.scene import NEAR_M
+from services.mapping.rasterizer.shuffles import load_four, load_three, store_records
+from services.mapping.rasterizer.simd import (
+    LANES,
+    inlined,
+    kernel,
+    maximum,
+    minimum,
+    round_down,
+    round_up,
+    select,
+    splat,
+    split_exponent,
+    square_root,
 )
-from services.mapping.rasterizer.memory import fetch_add, store
-from services.mapping.rasterizer.scene import DILATION_PX2, NEAR_M
-from services.mapping.rasterizer.simd import inlined, kernel, square_root
-from services.mapping.rasterizer.vectors import cross, dot
+from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row
 
 _NEAR = np.float32(NEAR_M)
-_DILATION = np.float32(DILATION_PX2)
-_DILATION_SQUARED = np.float32(DILATION_PX2**2)
-_ZERO, _HALF, _QUARTER, _EIGHTH = (np.float32(x) for x in (0.0, 0.5, 0.25, 0.125))
-_SIXTEEN = np.float32(16.0)
-_FAR_PX = np.float32(1e6)  # keeps positions inside the range of int32
+_ZERO, _ONE, _HALF, _FOUR = (np.float32(x) for x in (0.0, 1.0, 0.5, 4.0))
+_PER_TILE = np.float32(1.0 / TILE)
 
-# Rows of 8 lanes in which a block's ellipses wait for the scalar part.
-_X, _Y, _Z, _A, _B, _C, _E1, _E2 = range(8)
+# ln(1 + f) / f^3 - 1 / f^2 + 1 / (2 f) for f from -0.293 to 0.414, highest power first.
+_LOG = tuple(
+    np.float32(c)
+    for c in (
+        7.0376836292e-2,
+        -1.1514610310e-1,
+        1.1676998740e-1,
+        -1.2420140846e-1,
+        1.4249322787e-1,
+        -1.6668057665e-1,
+        2.0000714765e-1,
+        -2.4999993993e-1,
+        3.3333331174e-1,
+    )
+)
+_LN_2_HIGH, _LN_2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
+_NEVER = np.float32(-1e4)  # the logarithm of nothing, as good as
 
 
 @kernel
 def project(splats, camera, projected, counter):
     """Fill `projected`, a chunk of Gaussians per count."""
-    lanes, shapes = np.empty(BLOCK_ROWS * 8, np.float32), np.empty(64, np.float32)
-    total = len(splats.opacities)
+    spare, total = spare_block(), len(splats.opacities)
     while True:
         chunk = fetch_add(counter, 0, 1)
         start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, total)
         if start >= stop:
             return
-        valid = True
-        for base in range(start, stop, 8):
-            count = min(8, stop - base)
-            for l in range(8):  # where fewer than 8 remain, repeat the first
-                gather_lane(splats, base + (l if l < count else 0), l, lanes)
-            _shape_block(lanes, camera, shapes)
-            for l in range(count):
-                i = base + l
-                valid &= _is_finite(splats, lanes, i, l)
-                _write_record(projected.records, splats, shapes, i, l)
-                projected.counts[i] = _write_box(projected, camera, i)
+        valid, hits = True, projected.hits[chunk]
+        hits[:] = 0
+        for base in range(start, stop, LANES):
+            source, i = whole_block(splats, spare, base)
+            valid &= _project_block(source, i, camera, projected, base)
+            for gaussian in range(base, min(base + LANES, stop)):
+                _count_hits(projected, gaussian, camera, hits)
         projected.valid[chunk] = valid
 
 
 @inlined
-def _shape_block(lanes, camera, shapes):
-    """Means, dilated covariances and whitening factors of 8 Gaussians."""
-    seen = project_block(load_block(lanes), camera)
-    row_x, row_y = seen.spread
-    a, b, c = dot(row_x, row_x), dot(row_x, row_y), dot(row_y, row_y)
-    normal = cross(row_x, row_y)
-    # a c - b^2 by Lagrange's identity: exact zero cannot come out negative for a thin ellipse.
-    determinant = dot(normal, normal) + (a + c) * _DILATION + _DILATION_SQUARED
-    a, c = a + _DILATION, c + _DILATION
-    store(shapes, _X * 8, seen.u * camera.fx + camera.cx)
-    store(shapes, _Y * 8, seen.v * camera.fy + camera.cy)
-    store(shapes, _Z * 8, seen.z)
-    store(shapes, _A * 8, a)
-    store(shapes, _B * 8, b)
-    store(shapes, _C * 8, c)
-    store(shapes, _E1 * 8, _QUARTER / square_root(a))
-    store(shapes, _E2 * 8, square_root(a / determinant) * _QUARTER)
-
-
-@inlined
-def _is_finite(splats, lanes, i, l):
-    """Whether all 14 numbers of a Gaussian are finite; 0 * x is NaN for the others."""
-    total = _ZERO
-    for row in range(BLOCK_ROWS):
-        total += lanes[row * 8 + l] * _ZERO
-    for k in range(3):
-        total += splats.colours[i * 3 + k] * _ZERO
-    return total == _ZERO
-
-
-@inlined
-def _write_record(records, splats, shapes, i, l):
-    """One cache line with all that the tiles need."""
-    r = i * RECORD
-    a, b, c = shapes[_A * 8 + l], shapes[_B * 8 + l], shapes[_C * 8 + l]
-    log_opacity = math.log(splats.opacities[i]) * _EIGHTH
-    reach = max(_ZERO, log_opacity - CUT)
-    records[r + MEAN_X], records[r + MEAN_Y] = shapes[_X * 8 + l], shapes[_Y * 8 + l]
-    records[r + E1], records[r + E2] = shapes[_E1 * 8 + l], shapes[_E2 * 8 + l]
-    records[r + SHEAR], records[r + SLANT] = b / a, b / c
-    records[r + LOG_OPACITY], records[r + REACH] = log_opacity, reach
-    for k in range(3):
-        records[r + RED + k] = splats.colours[i * 3 + k]
-    records[r + DEPTH] = shapes[_Z * 8 + l]
-    records[r + HALF_WIDTH] = math.sqrt(_SIXTEEN * reach * a)
-    records[r + HALF_HEIGHT] = math.sqrt(_SIXTEEN * reach * c)
-
-
-@inlined
-def _first_and_last(centre, half):
-    """Pixels whose centres lie within `half` of `centre`, clamped to the range of int32."""
-    first = math.ceil(max(centre - half - _HALF, -_FAR_PX))
-    return first, math.floor(min(centre + half - _HALF, _FAR_PX))
-
-
-@inlined
-def _write_box(projected, camera, i):
-    """The box of tiles that may see the Gaussian; gives how many there are."""
-    r, records, boxes = i * RECORD, projected.records, projected.boxes
+def _project_block(splats, i, camera, projected, place):
+    """Write the records and boxes of LANES Gaussians; gives whether all inputs were finite."""
+    block, colour = load_block(splats, i), load_three(splats.colours, i * 3)
+    seen = project_block(block, camera)
+    a, b, c, e1, e2 = shapes_of(seen.spread)
+    x, y = seen.u * camera.fx + camera.cx, seen.v * camera.fy + camera.cy
+    log_opacity = _log(block.opacity) * 0.125
+    reach = maximum(log_opacity - CUT, splat(_ZERO))
+    half_width, half_height = square_root(reach * a) * _FOUR, square_root(reach * c) * _FOUR
+    ellipse = (half_width, half_height, reach, b / c)
+    numbers = (x, y, e1, b / a, e2, log_opacity, *colour, seen.z, *ellipse, reach, reach)
+    store_records(projected.records, place * RECORD, numbers)
     # Written so that NaN fails: a projection may overflow although its inputs were finite.
-    if not (records[r + DEPTH] >= _NEAR and records[r + LOG_OPACITY] > CUT):
-        return 0
-    left, right = _first_and_last(records[r + MEAN_X], records[r + HALF_WIDTH])
-    top, bottom = _first_and_last(records[r + MEAN_Y], records[r + HALF_HEIGHT])
-    if not (left <= right and top <= bottom and right >= 0 and bottom >= 0):
-        return 0
-    if not (left < camera.width and top < camera.height):
-        return 0
-    boxes[i * 4], boxes[i * 4 + 1] = _tile_range(left, right, camera.width)
-    boxes[i * 4 + 2], boxes[i * 4 + 3] = _tile_range(top, bottom, camera.height)
-    columns = boxes[i * 4 + 1] - boxes[i * 4] + 1
-    return columns * (boxes[i * 4 + 3] - boxes[i * 4 + 2] + 1)
+    visible = (seen.z >= _NEAR) & (log_opacity > CUT)
+    columns = x - half_width - _HALF, x + half_width - _HALF
+    rows = y - half_height - _HALF, y + half_height - _HALF
+    _write_box(projected.boxes, place, camera, (columns, rows), visible)
+    return _are_finite(block, splats, i, colour)
 
 
 @inlined
-def _tile_range(first, last, size):
-    return max(0, int(first)) // TILE, min(size - 1, int(last)) // TILE
+def _log(x):
+    """The natural logarithm, relative error 1e-7; far below zero for zero and less."""
+    exponent, mantissa = split_exponent(x)
+    f = mantissa - _ONE
+    total = f * _LOG[0] + _LOG[1]
+    total = total * f + _LOG[2]
+    total = total * f + _LOG[3]
+    total = total * f + _LOG[4]
+    total = total * f + _LOG[5]
+    total = total * f + _LOG[6]
+    total = total * f + _LOG[7]
+    total = total * f + _LOG[8]
+    square = f * f
+    total = total * f * square + exponent * _LN_2_LOW - square * _HALF + f
+    return select(x > _ZERO, total + exponent * _LN_2_HIGH, _NEVER)
+
+
+@inlined
+def _are_finite(block, splats, i, colour):
+    """Whether all inputs are; 0 * x is NaN for the others."""
+    quat = load_four(splats.quats, i * 4)
+    (a, b, c), (d, e, f), (g, h, j, k) = block.mean, block.scale, quat
+    l, m, n = colour
+    total = a * _ZERO + b * _ZERO + c * _ZERO + d * _ZERO + e * _ZERO + f * _ZERO + g * _ZERO
+    total = total + h * _ZERO + j * _ZERO + k * _ZERO + l * _ZERO + m * _ZERO + n * _ZERO
+    return all_lanes(total + block.opacity * _ZERO >= _ZERO)
+
+
+@inlined
+def _write_box(boxes, place, camera, ranges, visible):
+    """The tiles that a box of pixels touches; none, as first > last, where it is not visible."""
+    padded = len(boxes) // 4
+    columns, rows = ranges
+    left, right = round_up(columns[0]), round_down(columns[1])
+    top, bottom = round_up(rows[0]), round_down(rows[1])
+    last_x, last_y = np.float32(camera.width - 1), np.float32(camera.height - 1)
+    visible = visible & (left <= right) & (top <= bottom) & (right >= _ZERO) & (bottom >= _ZERO)
+    visible = visible & (left <= last_x) & (top <= last_y)
+    first_column = select(visible, _tile_of(left, last_x), _ONE)
+    store_indices(boxes, place, first_column)
+    store_indices(boxes, padded + place, select(visible, _tile_of(right, last_x), _ZERO))
+    store_indices(boxes, 2 * padded + place, select(visible, _tile_of(top, last_y), _ZERO))
+    store_indices(boxes, 3 * padded + place, select(visible, _tile_of(bottom, last_y), _ZERO))
+
+
+@inlined
+def _tile_of(position, last):
+    return round_down(minimum(maximum(position, splat(_ZERO)), splat(last)) * _PER_TILE)
+
+
+@inlined
+def _count_hits(projected, i, camera, hits):
+    """Count a Gaussian in each tile that it hits."""
+    left, right, top, bottom = tile_box(projected.boxes, i)
+    columns = (camera.width + TILE - 1) // TILE
+    for row in range(top, bottom + 1):
+        first, last = left, right
+        if left < right and top < bottom:
+            first, last = tiles_of_row(projected.records, i, row, left, right)
+        for column in range(first, last + 1):
+            hits[row * columns + column] += 1

@@ -1,31 +1,47 @@
-"""Large arrays that are kept between calls."""
+"""Large arrays that are kept between calls.
+
+Touching fresh pages costs more than what the kernels write there, and the system clears them one
+thread at a time.
+"""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import weakref
+from collections import deque
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
+
+_MOST = 48  # arrays kept; two forward and backward passes have fewer
 
 
 class Scratch:
-    """Lends float32 arrays; touching fresh pages costs more than what kernels write there."""
+    """Lends arrays, and takes each back when nothing refers to it any more.
+
+    Any thread may borrow, and any thread may be the one that drops the last reference.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._free: list[NDArray[np.float32]] = []
+        self._free: deque[NDArray[np.uint8]] = deque(maxlen=_MOST)
 
-    @contextmanager
-    def borrow(self, size: int) -> Iterator[NDArray[np.float32]]:
-        """An array of at least `size` numbers that nobody else has, contents arbitrary."""
-        with self._lock:
-            array = self._free.pop() if self._free else np.empty(0, np.float32)
-        if array.size < size:
-            array = np.empty(size + size // 4, np.float32)
-        try:
-            yield array
-        finally:
-            with self._lock:
-                self._free.append(array)
+    def borrow(self, size: int, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+        """An array of `size` numbers that nobody else has, contents arbitrary."""
+        num_bytes = size * np.dtype(dtype).itemsize
+        memory = self._take(num_bytes)
+        # Not a slice: views of it must keep alive what the finalizer watches, not its owner.
+        lent = np.frombuffer(memory.data[:num_bytes], dtype)
+        weakref.finalize(lent, self._free.append, memory).atexit = False
+        return lent
+
+    def _take(self, num_bytes: int) -> NDArray[np.uint8]:
+        """A free array that is large enough, but not far too large, or a new one."""
+        for _ in range(len(self._free)):
+            try:
+                memory = self._free.popleft()
+            except IndexError:
+                break
+            if num_bytes <= memory.size <= 2 * num_bytes + 4096:
+                return memory
+            self._free.append(memory)
+        return np.empty(num_bytes + num_bytes // 4, np.uint8)

@@ -1,8 +1,8 @@
-"""Explicit SIMD for Numba: a vector of 8 float32 lanes, lowered to LLVM's `<8 x float>`.
+"""Explicit SIMD for Numba: a vector of float32 lanes, lowered to LLVM's `<LANES x float>`.
 
-LLVM legalises it to what the host has (AVX-512VL, AVX2, two SSE or NEON registers). Arithmetic
-works lane by lane and takes a number in place of either vector; comparisons give a mask for
-`select`.
+It has 16 lanes where the kernels are compiled for AVX-512, else 8, which LLVM legalises to what
+the host has (AVX2, two SSE or NEON registers). Arithmetic works lane by lane and takes a number
+in place of either vector; comparisons give a mask for `select`.
 """
 
 from __future__ import annotations
@@ -13,19 +13,34 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding
 import llvmlite.ir as ir
-from numba import njit
+import numba
 from numba.core import cgutils, extending, types
 from numba.core.extending import models, register_model
 from numba.core.imputils import lower_builtin
 from numba.core.typing import templates
 from numba.core.typing.templates import AbstractTemplate, signature
 
-LANES = 8
+
+def _has_avx512() -> bool:
+    """Whether Numba compiles for AVX-512: its settings may name another processor than the host."""
+    if config.CPU_FEATURES is not None:
+        return "+avx512f" in config.CPU_FEATURES
+    return config.CPU_NAME is None and llvmlite.binding.get_host_cpu_features().get(
+        "avx512f", False
+    )
+
+
+LANES = 16 if _has_avx512() else 8
+STRIP_COLUMNS = 8  # a vector covers this many columns of as many rows as it has lanes for
+STRIP_ROWS = LANES // STRIP_COLUMNS
 
 # Decorators that replace a function by another kind of object, which Numba's stubs do not say.
 intrinsic: Any = extending.intrinsic
 infer_global: Any = templates.infer_global
+_njit: Any = numba.njit
+_config: Any = numba.config  # its attributes are made at import
 
 # No "nnan" and "ninf": lanes outside an ellipse may overflow, and a select drops them.
 FAST_MATH = ("contract", "reassoc", "nsz", "arcp")
@@ -38,7 +53,7 @@ _OPTIONS: dict[str, Any] = {
 
 _FLOAT = ir.FloatType()
 _INT32 = ir.IntType(32)
-float8_ir = ir.VectorType(_FLOAT, LANES)
+floats_ir = ir.VectorType(_FLOAT, LANES)
 _INTS = ir.VectorType(_INT32, LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
 
@@ -49,7 +64,7 @@ def kernel(function: Callable) -> Any:
     The compiled code is cached on disk. Numba would renew it only when the function's own file
     changes, and not when what it inlines does: the stamp covers this whole folder.
     """
-    dispatcher: Any = njit(cache=True, **_OPTIONS)(function)
+    dispatcher: Any = _njit(cache=True, **_OPTIONS)(function)
     cache_file = dispatcher._cache._cache_file
     cache_file._source_stamp = (cache_file._source_stamp, _newest_source_ns())
     return dispatcher
@@ -61,36 +76,50 @@ def _newest_source_ns() -> int:
 
 
 def inlined(function: Callable) -> Any:
-    """Compile a function that only kernels call; it vanishes into its caller."""
-    return njit(forceinline=True, **_OPTIONS)(function)
+    """Compile a function that only kernels call; it vanishes into its caller.
+
+    It must not create or return arrays: it does not count references to them, which in an inner
+    loop would cost more than the loop.
+    """
+    return _njit(forceinline=True, _nrt=False, **_OPTIONS)(function)
 
 
-class Float8Type(types.Type):
-    """The Numba type of 8 float32 lanes."""
+def allocating(function: Callable) -> Any:
+    """Like `inlined`, for functions that create or return arrays."""
+    return _njit(forceinline=True, **_OPTIONS)(function)
+
+
+def reproducible(function: Callable) -> Any:
+    """Like `inlined`, but without fast mathematics: the same bits wherever it ends up."""
+    return _njit(forceinline=True, _nrt=False, **{**_OPTIONS, "fastmath": False})(function)
+
+
+class FloatsType(types.Type):
+    """The Numba type of LANES float32 numbers."""
 
     def __init__(self) -> None:
-        super().__init__("float8")
+        super().__init__(f"floats{LANES}")
 
 
-class Mask8Type(types.Type):
-    """The Numba type of 8 truth values."""
+class MaskType(types.Type):
+    """The Numba type of LANES truth values."""
 
     def __init__(self) -> None:
-        super().__init__("mask8")
+        super().__init__(f"mask{LANES}")
 
 
-float8 = Float8Type()
-mask8 = Mask8Type()
+floats = FloatsType()
+mask = MaskType()
 
 
-@register_model(Float8Type)
-class _Float8Model(models.PrimitiveModel):
+@register_model(FloatsType)
+class _FloatsModel(models.PrimitiveModel):
     def __init__(self, manager, numba_type) -> None:
-        super().__init__(manager, numba_type, float8_ir)
+        super().__init__(manager, numba_type, floats_ir)
 
 
-@register_model(Mask8Type)
-class _Mask8Model(models.PrimitiveModel):
+@register_model(MaskType)
+class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager, numba_type) -> None:
         super().__init__(manager, numba_type, _BITS)
 
@@ -100,14 +129,14 @@ def _constant(numba_type: ir.Type, values: Any) -> ir.Constant:
 
 
 def shuffle(builder, x, y, order: list[int]):
-    return builder.shuffle_vector(x, y, _constant(_INTS, order))
+    return builder.shuffle_vector(x, y, _constant(ir.VectorType(_INT32, len(order)), order))
 
 
-def _as_float8(context, builder, numba_type, value):
+def _as_floats(context, builder, numba_type, value):
     """The value itself when it is a vector, else the number in every lane."""
-    if isinstance(numba_type, Float8Type):
+    if isinstance(numba_type, FloatsType):
         return value
-    undefined = _constant(float8_ir, ir.Undefined)
+    undefined = _constant(floats_ir, ir.Undefined)
     number = context.cast(builder, value, numba_type, types.float32)
     return shuffle(
         builder, builder.insert_element(undefined, number, _INT32(0)), undefined, [0] * LANES
@@ -116,14 +145,14 @@ def _as_float8(context, builder, numba_type, value):
 
 def _pair(context, builder, sig, args):
     """Both operands of a binary operation as vectors."""
-    return tuple(_as_float8(context, builder, t, a) for t, a in zip(sig.args, args, strict=True))
+    return tuple(_as_floats(context, builder, t, a) for t, a in zip(sig.args, args, strict=True))
 
 
 def _is_binary(args) -> bool:
     return (
         len(args) == 2
-        and any(isinstance(a, Float8Type) for a in args)
-        and all(isinstance(a, Float8Type | types.Number) for a in args)
+        and any(isinstance(a, FloatsType) for a in args)
+        and all(isinstance(a, FloatsType | types.Number) for a in args)
     )
 
 
@@ -139,9 +168,9 @@ def _define_binary(operation: Callable, result: types.Type, emit: Callable) -> N
         return emit(builder, *_pair(context, builder, sig, args))
 
     for left, right in (
-        (Float8Type, Float8Type),
-        (Float8Type, types.Number),
-        (types.Number, Float8Type),
+        (FloatsType, FloatsType),
+        (FloatsType, types.Number),
+        (types.Number, FloatsType),
     ):
         lower_builtin(operation, left, right)(lower)
 
@@ -154,24 +183,24 @@ def _comparison(sign: str) -> Callable:
     return lambda builder, x, y: builder.fcmp_ordered(sign, x, y)
 
 
-_define_binary(operator.add, float8, _arithmetic("fadd"))
-_define_binary(operator.sub, float8, _arithmetic("fsub"))
-_define_binary(operator.mul, float8, _arithmetic("fmul"))
-_define_binary(operator.truediv, float8, _arithmetic("fdiv"))
-_define_binary(operator.ge, mask8, _comparison(">="))
-_define_binary(operator.gt, mask8, _comparison(">"))
-_define_binary(operator.lt, mask8, _comparison("<"))
-_define_binary(operator.le, mask8, _comparison("<="))
+_define_binary(operator.add, floats, _arithmetic("fadd"))
+_define_binary(operator.sub, floats, _arithmetic("fsub"))
+_define_binary(operator.mul, floats, _arithmetic("fmul"))
+_define_binary(operator.truediv, floats, _arithmetic("fdiv"))
+_define_binary(operator.ge, mask, _comparison(">="))
+_define_binary(operator.gt, mask, _comparison(">"))
+_define_binary(operator.lt, mask, _comparison("<"))
+_define_binary(operator.le, mask, _comparison("<="))
 
 
 @infer_global(operator.and_)
 class _MaskAnd(AbstractTemplate):
     def generic(self, args, kws):
-        masks = len(args) == 2 and all(isinstance(a, Mask8Type) for a in args)
-        return signature(mask8, *args) if masks else None
+        masks = len(args) == 2 and all(isinstance(a, MaskType) for a in args)
+        return signature(mask, *args) if masks else None
 
 
-lower_builtin(operator.and_, Mask8Type, Mask8Type)(
+lower_builtin(operator.and_, MaskType, MaskType)(
     lambda context, builder, sig, args: builder.and_(*args)
 )
 
@@ -181,17 +210,33 @@ def splat(typing_context, number):
     """The number in every lane."""
 
     def generate(context, builder, sig, args):
-        return _as_float8(context, builder, sig.args[0], args[0])
+        return _as_floats(context, builder, sig.args[0], args[0])
 
-    return float8(number), generate
+    return floats(number), generate
+
+
+def _fixed(numbers):
+    """Signature and code of a constant vector."""
+    values = [float(number) for number in numbers]
+    return floats(), lambda context, builder, sig, args: _constant(floats_ir, values)
 
 
 @intrinsic
 def ramp(typing_context):
-    """The lanes 0, 1, ... 7."""
-    return float8(), lambda context, builder, sig, args: _constant(
-        float8_ir, [float(i) for i in range(LANES)]
-    )
+    """The lanes 0, 1, 2 ..."""
+    return _fixed(range(LANES))
+
+
+@intrinsic
+def strip_columns(typing_context):
+    """The column of each lane of a strip: 0 to 7, in every row."""
+    return _fixed(lane % STRIP_COLUMNS for lane in range(LANES))
+
+
+@intrinsic
+def strip_rows(typing_context):
+    """The row of each lane of a strip."""
+    return _fixed(lane // STRIP_COLUMNS for lane in range(LANES))
 
 
 @intrinsic
@@ -199,11 +244,11 @@ def select(typing_context, mask, chosen, otherwise):
     """`chosen` in the lanes where the mask holds, `otherwise` in the others."""
 
     def generate(context, builder, sig, args):
-        x = _as_float8(context, builder, sig.args[1], args[1])
-        y = _as_float8(context, builder, sig.args[2], args[2])
+        x = _as_floats(context, builder, sig.args[1], args[1])
+        y = _as_floats(context, builder, sig.args[2], args[2])
         return builder.select(args[0], x, y)
 
-    return float8(mask, chosen, otherwise), generate
+    return floats(mask, chosen, otherwise), generate
 
 
 @intrinsic
@@ -214,7 +259,7 @@ def minimum(typing_context, x, y):
         left, right = _pair(context, builder, sig, args)
         return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
-    return float8(x, y), generate
+    return floats(x, y), generate
 
 
 @intrinsic
@@ -225,7 +270,7 @@ def maximum(typing_context, x, y):
         left, right = _pair(context, builder, sig, args)
         return builder.select(builder.fcmp_ordered(">", left, right), left, right)
 
-    return float8(x, y), generate
+    return floats(x, y), generate
 
 
 @intrinsic
@@ -234,19 +279,61 @@ def negative_magnitude(typing_context, x):
 
     def generate(context, builder, sig, args):
         signs = _constant(_INTS, [0x80000000] * LANES)
-        return builder.bitcast(builder.or_(builder.bitcast(args[0], _INTS), signs), float8_ir)
+        return builder.bitcast(builder.or_(builder.bitcast(args[0], _INTS), signs), floats_ir)
 
-    return float8(x), generate
+    return floats(x), generate
+
+
+@intrinsic
+def magnitude(typing_context, x):
+    """`abs(x)`: clears the sign bit."""
+
+    def generate(context, builder, sig, args):
+        others = _constant(_INTS, [0x7FFFFFFF] * LANES)
+        return builder.bitcast(builder.and_(builder.bitcast(args[0], _INTS), others), floats_ir)
+
+    return floats(x), generate
+
+
+def _by_llvm(name: str) -> Callable:
+    """Code that applies an LLVM function to every lane."""
+
+    def generate(context, builder, sig, args):
+        kind = ir.FunctionType(floats_ir, [floats_ir])
+        full = f"llvm.{name}.v{LANES}f32"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), args)
+
+    return generate
 
 
 @intrinsic
 def square_root(typing_context, x):
     """The square root of every lane."""
+    return floats(x), _by_llvm("sqrt")
+
+
+@intrinsic
+def round_down(typing_context, x):
+    """The greatest whole number not above each lane."""
+    return floats(x), _by_llvm("floor")
+
+
+@intrinsic
+def round_up(typing_context, x):
+    """The least whole number not below each lane."""
+    return floats(x), _by_llvm("ceil")
+
+
+@intrinsic
+def split_exponent(typing_context, x):
+    """(e, m) of each positive lane x = 2^e m, with m from 0.7071 to 1.4142."""
 
     def generate(context, builder, sig, args):
-        kind = ir.FunctionType(float8_ir, [float8_ir])
-        return builder.call(
-            cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f32"), args
-        )
+        bits = builder.bitcast(args[0], _INTS)
+        above = builder.sub(bits, _constant(_INTS, [0x3F3504F3] * LANES))
+        exponent = builder.ashr(above, _constant(_INTS, [23] * LANES))
+        rest = builder.sub(bits, builder.shl(exponent, _constant(_INTS, [23] * LANES)))
+        parts = builder.sitofp(exponent, floats_ir), builder.bitcast(rest, floats_ir)
+        return context.make_tuple(builder, sig.return_type, parts)
 
-    return float8(x), generate
+    return types.UniTuple(floats, 2)(x), generate

@@ -8,10 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.rasterizer.binning import sort_keys
-from services.mapping.rasterizer.kernel_types import BLUE, DEPTH, E2, GREEN, RECORD, RED
+from services.mapping.rasterizer.kernel_types import BLUE, DEPTH, E2, GREEN, RED
 from services.mapping.rasterizer.lanes import any_lane
 from services.mapping.rasterizer.memory import element, fetch_add, load, store
-from services.mapping.rasterizer.simd import inlined, kernel, negative_magnitude, select, splat
+from services.mapping.rasterizer.shuffles import store_three
+from services.mapping.rasterizer.simd import (
+    LANES,
+    STRIP_ROWS,
+    inlined,
+    kernel,
+    magnitude,
+    negative_magnitude,
+    select,
+    splat,
+)
 from services.mapping.rasterizer.tiles import (
     BATCH,
     ONE,
@@ -19,9 +29,11 @@ from services.mapping.rasterizer.tiles import (
     STOP,
     STRIDE,
     ZERO,
+    cut_strips,
+    empty_strips,
     falloff,
-    footprint,
-    load_batch,
+    load_rows,
+    store_rows,
     strip_at,
     tile_at,
 )
@@ -29,6 +41,7 @@ from services.mapping.rasterizer.tiles import (
 # Planes of a tile: red, green, blue, depth, then transmittance. The sign of the transmittance
 # says that the pixel has stopped; the pixels outside the image have none.
 _LIGHT = 4 * PLANE
+_ROWS_DOWN = np.float32(STRIP_ROWS)
 
 
 class Images(NamedTuple):
@@ -42,8 +55,8 @@ class Images(NamedTuple):
 @kernel
 def blend_tiles(tiles, images, counter):
     """Sort and blend one tile per count, front to back."""
-    records, lists, camera = tiles
-    planes, batch = np.empty(5 * PLANE, np.float32), np.empty(BATCH * RECORD, np.float32)
+    _, lists, camera = tiles
+    planes, strips = np.empty(5 * PLANE, np.float32), empty_strips()
     spare = np.empty(_longest(lists.tile_starts), np.uint64)
     histograms = np.empty((4, 256), np.int32)
     while True:
@@ -53,16 +66,21 @@ def blend_tiles(tiles, images, counter):
         tile = tile_at(index, camera)
         first, stop = np.int64(lists.tile_starts[index]), np.int64(lists.tile_starts[index + 1])
         sort_keys(lists.keys[first:stop], spare, histograms)
-        _write_order(lists, first, stop)
-        _open_planes(planes, tile)
-        while first < stop and _has_light(planes, tile):
-            count = min(BATCH, stop - first)
-            load_batch(records, lists.gaussians, first, count, batch)
-            for k in range(count):
-                _paint(planes, batch, k * RECORD, tile)
-            first += count
-        lists.tile_ends[index] = first
+        lists.tile_ends[index] = _blend(tiles, tile, (first, stop), planes, strips)
         _write_pixels(planes, tile, camera.width, images)
+
+
+@inlined
+def _blend(tiles, tile, span, planes, strips):
+    """Blend a tile's list into its planes; gives where it stopped because the tile was full."""
+    first, stop = span
+    _open_planes(planes, tile)
+    while first < stop and _has_light(planes, tile):
+        last = min(first + BATCH, stop)
+        for s in range(cut_strips(tiles, tile, (first, last, stop), strips)):
+            _paint(planes, tiles.records, strips, s)
+        first = last
+    return first
 
 
 @inlined
@@ -74,75 +92,64 @@ def _longest(starts):
 
 
 @inlined
-def _write_order(lists, first, stop):
-    """Gaussians in order of depth, and for each pair the place it came to."""
-    for place in range(first, stop):
-        before = first + np.int64(lists.keys[place] & np.uint64(0xFFFFFFFF))
-        lists.gaussians[place] = lists.unsorted[before]
-        lists.ranks[before] = place
-
-
-@inlined
 def _open_planes(planes, tile):
     planes[:] = ZERO
     for y in range(tile.height):
-        for x in range(tile.width):
-            planes[_LIGHT + y * STRIDE + x] = ONE
+        row = _LIGHT + y * STRIDE
+        planes[row : row + tile.width] = ONE
 
 
 @inlined
 def _has_light(planes, tile):
     """Whether any pixel still lets light through."""
     for y in range(tile.height):
-        for x in range(0, tile.width, 8):
+        for x in range(0, tile.width, LANES):
             if any_lane(load(planes, _LIGHT + y * STRIDE + x) > ZERO):
                 return True
     return False
 
 
 @inlined
-def _paint(planes, batch, r, tile):
-    """Blend one Gaussian into a tile."""
-    box = footprint(batch, r, tile)
-    left, right, top, bottom = box
-    if top > bottom:
-        return
-    for x in range(left, right + 1, 8):
-        _paint_strip(planes, batch, r, strip_at(batch, r, tile, box, x))
-
-
-@inlined
-def _paint_strip(planes, batch, r, strip):
-    red, green = splat(element(batch, r + RED)), splat(element(batch, r + GREEN))
-    blue, depth = splat(element(batch, r + BLUE)), splat(element(batch, r + DEPTH))
-    e2_per_row = splat(element(batch, r + E2))
+def _paint(planes, records, strips, s):
+    """Blend one strip into a tile."""
+    strip, r = strip_at(records, strips, s), np.int64(element(strips.records, s))
+    red, green = splat(element(records, r + RED)), splat(element(records, r + GREEN))
+    blue, depth = splat(element(records, r + BLUE)), splat(element(records, r + DEPTH))
+    e2_per_row = splat(element(records, r + E2))
     place, dy = strip.place, strip.dy
-    for _ in range(strip.rows):
+    for _ in range(strip.steps):
         _, alpha = falloff(strip, strip.tilt + e2_per_row * dy)
-        light = load(planes, _LIGHT + place)
+        light = load_rows(planes, _LIGHT + place)
         weight = alpha * light
         rest = light - weight
         goes_on = rest > STOP
         weight = select(goes_on, weight, ZERO)
-        store(planes, _LIGHT + place, select(goes_on, rest, negative_magnitude(light)))
+        store_rows(planes, _LIGHT + place, select(goes_on, rest, negative_magnitude(light)))
         _add(planes, place, weight * red)
         _add(planes, PLANE + place, weight * green)
         _add(planes, 2 * PLANE + place, weight * blue)
         _add(planes, 3 * PLANE + place, weight * depth)
-        dy += ONE
-        place += STRIDE
+        dy = dy + _ROWS_DOWN
+        place += STRIP_ROWS * STRIDE
 
 
 @inlined
 def _add(planes, place, amount):
-    store(planes, place, load(planes, place) + amount)
+    store_rows(planes, place, load_rows(planes, place) + amount)
 
 
 @inlined
 def _write_pixels(planes, tile, width, images):
+    whole = tile.width // LANES * LANES
     for y in range(tile.height):
         pixel, p = (tile.top + y) * width + tile.left, y * STRIDE
-        for x in range(tile.width):
+        for x in range(0, whole, LANES):
+            red, green = load(planes, p + x), load(planes, PLANE + p + x)
+            colour = red, green, load(planes, 2 * PLANE + p + x)
+            store_three(images.colour, (pixel + x) * 3, colour)
+            store(images.depth, pixel + x, load(planes, 3 * PLANE + p + x))
+            store(images.alpha, pixel + x, ONE - magnitude(load(planes, _LIGHT + p + x)))
+        for x in range(whole, tile.width):
             for channel in range(3):
                 images.colour[(pixel + x) * 3 + channel] = planes[channel * PLANE + p + x]
             images.depth[pixel + x] = planes[3 * PLANE + p + x]
