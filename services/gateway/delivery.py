@@ -8,7 +8,7 @@ from collections import deque
 
 from services.gateway.config import MappingConfig
 from services.gateway.owner import MapOwner
-from shared.errors import PointSlamError
+from shared.errors import ConflictError, InputError, PointSlamError
 from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
@@ -66,6 +66,10 @@ class Delivery:
             try:
                 if self._entries[0].record.seq > self._owner.logged_seq:
                     await self._owner.advance(self._entries[0])
+            except (InputError, ConflictError) as error:
+                # It would be refused for ever, and everything behind it would wait.
+                seq = self._entries[0].record.seq
+                LOGGER.error("%s: frame %d is not in the map: %s", self._owner.session, seq, error)
             except PointSlamError as error:
                 LOGGER.warning("%s: map entry not taken: %s", self._owner.session, error)
                 await self._tell(error)

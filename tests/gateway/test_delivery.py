@@ -1,0 +1,46 @@
+"""Entries on their way to an owner that refuses some of them."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from services.gateway.config import MappingConfig
+from services.gateway.delivery import Delivery
+from shared.errors import ConflictError, InputError, UnavailableError
+from shared.frames import TrackingStatus
+from shared.tracks import Advance, FrameRecord
+
+
+def entry(seq):
+    T = np.eye(4)
+    return Advance(FrameRecord(seq, seq, TrackingStatus.TRACKED, 0, T, T, np.eye(6)))
+
+
+async def delivered(refusals):
+    """Deliver frames 0, 1 and 2 to an owner that raises `refusals[seq]` once each."""
+    taken = []
+
+    async def advance(entry):
+        if (error := refusals.pop(entry.record.seq, None)) is not None:
+            raise error
+        taken.append(entry.record.seq)
+
+    owner = SimpleNamespace(session="room", logged_seq=-1, advance=advance)
+    delivery = Delivery(owner, MappingConfig(retry_s=0.01))  # pyright: ignore[reportArgumentType]
+    for seq in range(3):
+        await delivery.put(entry(seq))
+    assert await delivery.flush(5.0)
+    return taken
+
+
+@pytest.mark.parametrize("error", [InputError("keyframe", "is bad"), ConflictError("too old")])
+def test_an_entry_that_is_refused_for_good_does_not_hold_up_the_others(error):
+    assert asyncio.run(delivered({1: error})) == [0, 2]
+
+
+def test_an_entry_that_finds_no_owner_is_sent_again():
+    assert asyncio.run(delivered({1: UnavailableError("gone")})) == [0, 1, 2]
