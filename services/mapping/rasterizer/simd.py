@@ -17,19 +17,21 @@ import llvmlite.binding
 import llvmlite.ir as ir
 import numba
 from numba.core import cgutils, extending, types
+from numba.core import config as numba_config
 from numba.core.extending import models, register_model
 from numba.core.imputils import lower_builtin
 from numba.core.typing import templates
 from numba.core.typing.templates import AbstractTemplate, signature
 
+_config: Any = numba_config  # its attributes are made at import
+
 
 def _has_avx512() -> bool:
     """Whether Numba compiles for AVX-512: its settings may name another processor than the host."""
-    if config.CPU_FEATURES is not None:
-        return "+avx512f" in config.CPU_FEATURES
-    return config.CPU_NAME is None and llvmlite.binding.get_host_cpu_features().get(
-        "avx512f", False
-    )
+    if _config.CPU_FEATURES is not None:
+        return "+avx512f" in _config.CPU_FEATURES
+    host = llvmlite.binding.get_host_cpu_features()
+    return _config.CPU_NAME is None and host.get("avx512f", False)
 
 
 LANES = 16 if _has_avx512() else 8
@@ -40,7 +42,6 @@ STRIP_ROWS = LANES // STRIP_COLUMNS
 intrinsic: Any = extending.intrinsic
 infer_global: Any = templates.infer_global
 _njit: Any = numba.njit
-_config: Any = numba.config  # its attributes are made at import
 
 # No "nnan" and "ninf": lanes outside an ellipse may overflow, and a select drops them.
 FAST_MATH = ("contract", "reassoc", "nsz", "arcp")
