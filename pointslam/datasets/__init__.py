@@ -15,14 +15,9 @@ from pointslam.datasets.base import (
 )
 from pointslam.datasets.folder import is_folder, read_folder
 from pointslam.datasets.replica import is_replica, read_replica
-from pointslam.datasets.scannetpp import (
-    is_dslr,
-    is_iphone,
-    is_scene,
-    read_dslr,
-    read_iphone,
-    read_scene,
-)
+from pointslam.datasets.scannetpp import is_scene, read_scene
+from pointslam.datasets.scannetpp_dslr import is_dslr, read_dslr
+from pointslam.datasets.scannetpp_iphone import is_iphone, read_iphone
 from pointslam.datasets.seven_scenes import is_seven_scenes, read_seven_scenes
 from pointslam.datasets.tum import is_tum, read_tum
 from shared.errors import SequenceError

@@ -40,7 +40,10 @@ class SequenceOptions:
 
 @dataclass(frozen=True)
 class SequenceFrame:
-    """One frame as recorded: the bytes of its files, untouched, and its true pose if known."""
+    """One frame as recorded: the bytes of its image files, untouched, and its true pose if known.
+
+    Frames of a video have no bytes of their own; they are encoded anew.
+    """
 
     t_ns: int
     stamp: str  # as the sequence's own files spell it
@@ -107,13 +110,39 @@ class Sequence(Protocol):
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Where one frame lies."""
+    """Where one frame lies; `number` where its files hold many frames."""
 
     t_ns: int
     stamp: str
     rgb: Path
     depth: Path | None
     T_world_camera: Matrix | None
+    number: int = 0
+
+
+class FrameReader(Protocol):
+    """Gets a frame's images out of its files; raises SequenceError naming the file."""
+
+    def colour(self, files: FrameFiles) -> ColourImage:
+        """The encoded colour image."""
+        ...
+
+    def depth(self, files: FrameFiles) -> DepthImage:
+        """The encoded depth image of a frame that has one."""
+        ...
+
+
+class ImageFiles:
+    """One image a file, whose bytes pass through untouched."""
+
+    def colour(self, files: FrameFiles) -> ColourImage:
+        """The bytes of the colour file."""
+        return read_colour(files.rgb)
+
+    def depth(self, files: FrameFiles) -> DepthImage:
+        """The bytes of the depth file."""
+        assert files.depth is not None
+        return read_depth(files.depth)
 
 
 @dataclass(frozen=True)
@@ -130,6 +159,7 @@ class FileSequence:
     calibration: Calibration
     frames: tuple[FrameFiles, ...]
     views: tuple[FrameFiles, ...] = ()
+    reader: FrameReader = ImageFiles()
 
     def __post_init__(self) -> None:
         if not self.frames:
@@ -169,16 +199,15 @@ class FileSequence:
     def frame(self, index: int) -> SequenceFrame:
         """Read one frame's files."""
         files = self.frames[index]
-        assert files.depth is not None
-        colour, depth = read_colour(files.rgb), read_depth(files.depth)
+        colour, depth = self.reader.colour(files), self.reader.depth(files)
         return SequenceFrame(files.t_ns, files.stamp, colour, depth, files.T_world_camera)
 
     def view(self, index: int) -> View:
         """Read one view's files."""
         files = self.views[index]
         assert files.T_world_camera is not None
-        depth = read_depth(files.depth) if files.depth is not None else None
-        return View(files.t_ns, read_colour(files.rgb), depth, files.T_world_camera)
+        depth = self.reader.depth(files) if files.depth is not None else None
+        return View(files.t_ns, self.reader.colour(files), depth, files.T_world_camera)
 
 
 def is_held_out(index: int, holdout: int) -> bool:
