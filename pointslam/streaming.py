@@ -67,7 +67,7 @@ def stream_sequence(session: Session, sequence: Sequence, options: StreamOptions
     with open_bar("frames", "frame", options.num_frames) as bar:
         for reply in session.stream(frames):
             if reply.error is not None:
-                raise _refused(sequence, len(replies), reply.error)
+                raise _refused(sequence, reply.seq, reply.error)
             replies.append(reply)
             bar.update(1)
             if time.monotonic() >= next_info:
@@ -78,7 +78,6 @@ def stream_sequence(session: Session, sequence: Sequence, options: StreamOptions
 
 
 def _refused(sequence: Sequence, index: int, error: ErrorDetail) -> PointSlamError:
-    # Replies come in order, one a frame, also for frames that could not be read at all.
     where = f"{sequence.name}, frame {index}, stamp {sequence.stamp(index)}"
     return PointSlamError(f"{where}: {error.field}: {error.reason}")
 

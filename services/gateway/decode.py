@@ -7,8 +7,10 @@ header, so a small file that claims 60000x60000 pixels costs nothing. Trackers d
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from typing import Any, TypeVar
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,10 +24,12 @@ from shared.stream import FLAGS, FrameMessage
 
 T = TypeVar("T")
 
+UNKNOWN = -1  # seq and t_ns of a message that cannot be read
 MAX_SEQ = 1 << 46  # a landmark's id is its keyframe's seq with 16 more bits
 MAX_T_NS = 1 << 62
 MAX_POSITION_M = 1e4  # points of a map are float32: a millimetre there
 _ROOM = 1 << 16  # of a message, beyond its images
+_MAX_FIELDS = 16
 _TAIL = 64  # an image's end marker may be followed by so many bytes of padding
 _PNG = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB, _RGBA = 0, 2, 6
@@ -47,6 +51,24 @@ def read_frame(data: bytes, calibration: Calibration) -> FrameMessage:
     message = named_from(FrameMessage, codec.unpack, data)
     check_frame(message, calibration)
     return message
+
+
+def read_numbers(data: bytes) -> tuple[int, int]:
+    """`seq` and `t_ns` of a message that may be damaged elsewhere; UNKNOWN where unreadable.
+
+    Everything else is skipped, so hostile content costs no Python values.
+    """
+    unpacker = msgpack.Unpacker(raw=False, max_array_len=len(FLAGS), max_map_len=_MAX_FIELDS)
+    found = {"seq": UNKNOWN, "t_ns": UNKNOWN}
+    with suppress(ValueError, TypeError, RecursionError, msgpack.UnpackException):
+        unpacker.feed(data)
+        for _ in range(unpacker.read_map_header()):
+            key = unpacker.unpack()
+            if key not in found:
+                unpacker.skip()
+            elif type(number := unpacker.unpack()) is int:
+                found[key] = number
+    return found["seq"], found["t_ns"]
 
 
 def _max_bytes(calibration: Calibration) -> int:

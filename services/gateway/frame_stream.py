@@ -15,8 +15,6 @@ from shared.stream import FrameMessage, FrameReply
 
 LOGGER = logging.getLogger(__name__)
 
-_UNKNOWN = -1  # seq and t_ns of a reply to a message that could not be read
-
 
 class SlowClientError(Exception):
     """The client does not read its replies."""
@@ -55,15 +53,20 @@ class FrameStream:
             reader.cancel()
             writer.cancel()
 
-    async def put(self, read: Callable[[], FrameMessage]) -> None:
-        """Take one frame; waits while the client is beyond its credit."""
+    async def put(
+        self, read: Callable[[], FrameMessage], numbers: Callable[[], tuple[int, int]]
+    ) -> None:
+        """Take one frame; waits while the client is beyond its credit.
+
+        `numbers` tells `seq` and `t_ns` of a frame that `read` refuses, so that its reply has them.
+        """
         await self._room.acquire()
-        seq = t_ns = _UNKNOWN
         try:
             message = read()
             seq, t_ns = message.seq, message.t_ns
             future = self._session.submit(message)
         except PointSlamError as error:
+            seq, t_ns = numbers()
             future = asyncio.get_running_loop().create_future()
             future.set_result(error)
         self._answers.put_nowait((seq, t_ns, future))

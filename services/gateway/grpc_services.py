@@ -9,7 +9,7 @@ from typing import Any
 
 import grpc
 
-from services.gateway.decode import check_frame
+from services.gateway.decode import UNKNOWN, check_frame
 from services.gateway.errors import detail, grpc_status
 from services.gateway.frame_stream import FrameStream, SlowClientError
 from services.gateway.map_queries import ask_render, export_pieces
@@ -158,9 +158,12 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
             session = await self._sessions.get(first.session_id)
 
             async def read(frames: FrameStream) -> None:
-                await frames.put(lambda: _frame(first, session))
+                await frames.put(lambda: _frame(first, session), lambda: _numbers(first))
                 async for request in requests:
-                    await frames.put(lambda request=request: _frame(request, session))
+                    await frames.put(
+                        lambda request=request: _frame(request, session),
+                        lambda request=request: _numbers(request),
+                    )
 
             async def send(reply: FrameReply) -> None:
                 await context.write(reply_to(reply))
@@ -178,6 +181,12 @@ def _frame(request: Any, session: Session) -> Any:
     message = frame_from(require(request, "frame"))
     check_frame(message, session.calibration)
     return message
+
+
+def _numbers(request: Any) -> tuple[int, int]:
+    if not request.HasField("frame"):
+        return UNKNOWN, UNKNOWN
+    return request.frame.seq, request.frame.t_ns
 
 
 class PoseService(pose_service_pb2_grpc.PoseServiceServicer):

@@ -7,7 +7,7 @@ import asyncio
 from fastapi import APIRouter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from services.gateway.decode import read_frame
+from services.gateway.decode import read_frame, read_numbers
 from services.gateway.errors import MESSAGE
 from services.gateway.frame_stream import FrameStream, SlowClientError
 from services.gateway.problems import problem_response
@@ -41,7 +41,10 @@ async def _serve(websocket: WebSocket, session: Session, sessions: Sessions) -> 
     async def read(frames: FrameStream) -> None:
         while (message := await websocket.receive())["type"] != "websocket.disconnect":
             data = message.get("bytes")
-            await frames.put(lambda data=data: _frame(data, session))
+            await frames.put(
+                lambda data=data: _frame(data, session),
+                lambda data=data: read_numbers(data or b""),
+            )
 
     async def send(reply: FrameReply) -> None:
         await websocket.send_bytes(codec.pack(reply))

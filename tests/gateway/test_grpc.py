@@ -117,6 +117,7 @@ def test_a_refused_frame_names_its_field_and_the_stream_goes_on(channel, name, i
     replies = list(stub.TrackFrames(iter([good[0], bad, empty, good[1]]), timeout=20))
 
     assert [reply.error.field for reply in replies] == ["", "depth.bytes", "frame", ""]
+    assert [reply.seq for reply in replies] == [0, 1, -1, 1]
     assert replies[-1].status == types_pb2.TRACKING_STATUS_TRACKED
 
 

@@ -1,12 +1,17 @@
 """Frame streams over WebSocket: order, credit, superseding, what live and offline promise."""
 
+import dataclasses
 import time
 
+import msgpack
 import pytest
 
 from pointslam.client import Client
+from pointslam.client.frame_stream import open_stream
+from shared import codec
 from shared.errors import UnavailableError
-from shared.frames import TrackingStatus
+from shared.frames import ColourImage, TrackingStatus
+from shared.stream import FrameReply
 
 SECOND = 1_000_000_000
 
@@ -58,6 +63,68 @@ def test_a_stream_goes_on_after_a_refused_frame(offline, rgb, depth):
     replies = list(offline.stream([good[0], good[0], good[1], good[2]]))
 
     assert [reply.error and reply.error.field for reply in replies] == [None, "seq", None, None]
+
+
+def with_rgb(message, data):
+    return dataclasses.replace(message, rgb=ColourImage(message.rgb.encoding, data))
+
+
+@pytest.mark.parametrize("image", [b"", b"\xff\xd8 no image", None])
+def test_a_damaged_image_is_answered_with_its_frames_numbers(offline, rgb, depth, image):
+    good = [offline.frame(rgb, depth, (i + 1) * SECOND) for i in range(3)]
+    damaged = with_rgb(good[1], good[1].rgb.bytes[:-400] if image is None else image)
+
+    replies = list(offline.stream([good[0], damaged, good[2]]))
+
+    assert [(reply.seq, reply.t_ns) for reply in replies] == [(m.seq, m.t_ns) for m in good]
+    assert [reply.error and reply.error.field for reply in replies] == [None, "rgb.bytes", None]
+
+
+SPOILT = {
+    "a field too many": lambda fields: {**fields, "speed": 3.0},
+    "a field too few": lambda fields: {k: v for k, v in fields.items() if k != "depth"},
+    "an unknown encoding": lambda fields: {**fields, "rgb": {"encoding": "bmp", "bytes": b""}},
+    "fields in another order": lambda fields: dict(sorted(fields.items()), rgb=None),
+    "images too large": lambda fields: {
+        **fields,
+        "rgb": {"encoding": "png", "bytes": bytes(10**6)},
+    },
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_message_that_is_no_frame_is_answered_with_its_numbers(
+    gateway, offline, rgb, depth, case
+):
+    fields = codec.to_plain(offline.frame(rgb, depth, 7 * SECOND))
+
+    reply = answer(gateway, offline, msgpack.packb(SPOILT[case](fields)))
+
+    assert reply.error is not None
+    assert (reply.seq, reply.t_ns) == (fields["seq"], 7 * SECOND)
+
+
+def test_a_message_cut_short_is_answered_with_what_came(gateway, offline, rgb, depth):
+    data = codec.pack(offline.frame(rgb, depth, 7 * SECOND))
+
+    reply = answer(gateway, offline, data[: len(data) // 2])
+
+    assert (reply.seq, reply.t_ns) == (0, 7 * SECOND)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x91" * 5000, msgpack.packb({"seq": "one"})])
+def test_a_message_without_numbers_is_answered_all_the_same(gateway, offline, data):
+    reply = answer(gateway, offline, data)
+
+    assert reply.error is not None
+    assert (reply.seq, reply.t_ns) == (-1, -1)
+
+
+def answer(gateway, session, data):
+    url = f"{gateway.url.replace('http', 'ws')}/v1/sessions/{session.name}/stream"
+    with open_stream(url) as connection:
+        connection.send(data)
+        return codec.unpack(FrameReply, connection.recv(decode=False))
 
 
 def test_an_error_of_the_frames_source_reaches_the_caller(offline, rgb, depth):
