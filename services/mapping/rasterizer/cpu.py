@@ -37,8 +37,8 @@ class CpuRasterizer:
     Several Python threads may use one rasterizer at the same time.
     """
 
-    def __init__(self, threads: int | None = None) -> None:
-        self._engine = _Engine(workers(threads or default_threads()), Scratch())
+    def __init__(self, threads: int | None = None, pool: Workers | None = None) -> None:
+        self._engine = Engine(pool or workers(threads or default_threads()), Scratch())
 
     def __call__(self, gaussians: Gaussians, view: View) -> Rendered:
         """Render the Gaussians; see `scene` for the definition.
@@ -68,7 +68,7 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class _Engine:
+class Engine:
     """Runs the kernels of a frame, in order."""
 
     pool: Workers
@@ -105,7 +105,7 @@ class _Engine:
 class _Run:
     """One forward pass, and where its backward pass leaves the statistics."""
 
-    engine: _Engine
+    engine: Engine
     frame: _Frame
     screen: ScreenStatistics
 
