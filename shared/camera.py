@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shared.errors import InputError
 
 MAX_IMAGE_SIDE_PX = 8192
+MAX_IMAGE_PX = 1 << 24  # of one image: a worker holds several arrays of this size
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,9 @@ class Intrinsics:
                 raise InputError(
                     f"{where}.{name}", f"must be 16 to {MAX_IMAGE_SIDE_PX} px, got {side}"
                 )
+        if self.width * self.height > MAX_IMAGE_PX:
+            found = f"{self.width}x{self.height}"
+            raise InputError(f"{where}.width", f"at most {MAX_IMAGE_PX} pixels, got {found}")
         for name, focal in (("fx", self.fx), ("fy", self.fy)):
             if not (math.isfinite(focal) and 1.0 <= focal <= 1e5):
                 raise InputError(f"{where}.{name}", f"must be 1 to 100000 px, got {focal}")

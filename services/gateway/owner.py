@@ -97,14 +97,17 @@ class MapOwner:
     async def pieces(
         self, question: str, message: object, kind: type, timeout_s: float
     ) -> AsyncIterator[Any]:
-        """Ask the owner for a reply in pieces; a gone owner ends it with an error."""
-        key = Keys.session(self.session, self.epoch, question)
+        """Ask the owner for a reply in pieces; like `ask` where nobody answers at all."""
+        deadline = time.monotonic() + self._config.reopen_wait_s
         is_empty = True
-        async for piece in self._fabric.bus.ask_stream(key, message, kind, timeout_s):
-            is_empty = False
-            yield piece
-        if is_empty:
-            raise GoneError(f"nobody answers {key}")
+        while is_empty:
+            epoch = self.epoch
+            key = Keys.session(self.session, epoch, question)
+            async for piece in self._fabric.bus.ask_stream(key, message, kind, timeout_s):
+                is_empty = False
+                yield piece
+            if is_empty:
+                await self.reopen(epoch, deadline)
 
     async def reopen(self, epoch: int, deadline: float) -> None:
         """Open the session on a live mapper, unless another call did so since `epoch`.

@@ -121,11 +121,13 @@ class OwnerConfig:
     max_pending_live: int = 100
     snapshot_interval_s: float = 180.0
     live_idle_s: float = 60.0  # live: optimise for so long after the last entry
+    session_idle_s: float = 600.0  # a session that nobody asks for so long goes to disk
     chunk_bytes: int = 4 << 20
 
     def __post_init__(self) -> None:
         _check(self.max_pending > 0, "owner.max_pending must be positive")
         _check(self.max_pending_live > 0, "owner.max_pending_live must be positive")
+        _check(self.session_idle_s > 0, "owner.session_idle_s must be positive")
         _check(self.chunk_bytes > 0, "owner.chunk_bytes must be positive")
 
 

@@ -76,6 +76,16 @@ class _Served:
     session: Session
     advances: ThreadPoolExecutor  # one thread: the entries of a session stay in order
     stops: list[Callable[[], None]] = field(default_factory=list)
+    used_s: float = field(default_factory=time.monotonic)
+
+    def noting_use(self, answer: Callable[[Any], object]) -> Callable[[Any], object]:
+        """`answer`, noting that somebody asked."""
+
+        def noted(request: Any) -> object:
+            self.used_s = time.monotonic()
+            return answer(request)
+
+        return noted
 
 
 class MapperHost:
@@ -87,6 +97,8 @@ class MapperHost:
         self._lock = threading.Lock()
         self._served: dict[str, _Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
+        self._is_closed = threading.Event()
+        self._janitor = threading.Thread(target=self._put_away_idle, name="janitor", daemon=True)
         with storage_errors(str(settings.data)):
             settings.data.mkdir(parents=True, exist_ok=True)
 
@@ -100,6 +112,7 @@ class MapperHost:
         ):
             self._bus.serve(Keys.mapper(name, question), kind, answer, self._queries)
         self._bus.declare_alive("mapping", name)
+        self._janitor.start()
 
     def open(self, request: OpenRequest) -> OpenReply:
         """Create a session, take one up from disk, or name the one that is open.
@@ -143,11 +156,23 @@ class MapperHost:
 
     def close(self) -> None:
         """Withdraw every session, with a snapshot of each."""
+        self._is_closed.set()
         with self._lock:
             for served in self._served.values():
                 _withdraw(served, is_saved=True)
             self._served.clear()
         self._queries.shutdown(wait=False, cancel_futures=True)
+
+    def _put_away_idle(self) -> None:
+        """Keep memory bounded: what nobody asks for goes to disk; opening it takes it up again."""
+        idle_s = self._settings.config.owner.session_idle_s
+        while not self._is_closed.wait(min(idle_s / 4, 15.0)):
+            with self._lock:
+                for name, served in list(self._served.items()):
+                    is_idle = time.monotonic() - served.used_s > idle_s
+                    if is_idle and not served.session.is_working:
+                        _withdraw(self._served.pop(name), is_saved=True)
+                        LOGGER.info("%s: idle, put away", name)
 
     def _open_folder(self, request: OpenRequest) -> SessionFolder:
         path = self._settings.data / request.session
@@ -174,7 +199,7 @@ class MapperHost:
         for question, kind, answer in _answers(session):
             executor = served.advances if question == "advance" else self._queries
             key = Keys.session(record.session, record.epoch, question)
-            served.stops.append(self._bus.serve(key, kind, answer, executor))
+            served.stops.append(self._bus.serve(key, kind, served.noting_use(answer), executor))
         LOGGER.info(
             "%s: epoch %d, %d frames, %d keyframes",
             record.session,

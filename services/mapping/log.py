@@ -78,7 +78,7 @@ def read_log(path: Path) -> Iterator[Advance]:
         size = os.fstat(file.fileno()).st_size
         while (start := file.tell()) < size:
             payload = _read_payload(file)
-            if payload is None and file.tell() < size:
+            if payload is None and not _is_blank(file):
                 raise StorageError(f"{path}: the entry at byte {start} fails its checksum")
             if payload is None:
                 LOGGER.warning("%s: %d bytes at the end are torn", path, size - start)
@@ -93,7 +93,7 @@ def count_keyframes(path: Path) -> int:
         size = os.fstat(file.fileno()).st_size
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
             end = file.tell() + _HEAD.unpack(head)[0]
-            if end > size:
+            if end > size or end == file.tell():
                 break
             file.seek(max(file.tell(), end - len(_NO_KEYFRAME)))
             count += file.read(end - file.tell()) != _NO_KEYFRAME
@@ -107,6 +107,14 @@ def _decoded(payload: bytes, path: Path) -> Advance:
         raise StorageError(f"{path}: an entry cannot be read ({error})") from None
 
 
+def _is_blank(file: IO[bytes]) -> bool:
+    """Whether nothing but zeros follows: a power cut may lengthen a file before it fills it."""
+    while block := file.read(1 << 20):
+        if any(block):
+            return False
+    return True
+
+
 def _read_payload(file: IO[bytes]) -> bytes | None:
     """The next payload; None where it is incomplete or fails its checksum."""
     head = file.read(_HEAD.size)
@@ -114,6 +122,6 @@ def _read_payload(file: IO[bytes]) -> bytes | None:
         return None
     length, checksum = _HEAD.unpack(head)
     payload = file.read(length)
-    if len(payload) < length or zlib.crc32(payload) != checksum:
+    if length == 0 or len(payload) < length or zlib.crc32(payload) != checksum:
         return None
     return payload

@@ -13,13 +13,13 @@ import torch
 
 from services.mapping.config import MappingConfig
 from services.mapping.export import chunks, export_ply, pack_folder
-from services.mapping.ledger import Ledger
+from services.mapping.ledger import Ledger, Resumed
 from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import MapFigures, Mapper
 from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
 from services.mapping.worker import MapWorker
-from shared.errors import InputError, PointSlamError
+from shared.errors import ConfigError, InputError, PointSlamError
 from shared.maps import (
     ExportChunk,
     ExportFormat,
@@ -69,11 +69,26 @@ class Session:
     def _take_up(self, mapper: Mapper) -> None:
         resumed = self.ledger.resumed
         if resumed.map is not None:
-            mapper.restore(resumed.map, resumed.frames)
+            self._restore(mapper, resumed)
             self._saved = self.ledger.entries - len(resumed.later), mapper.iterations
         for keyframe in resumed.later:
             self._worker.submit(keyframe)
         self.ledger.forget_resumed()
+
+    def _restore(self, mapper: Mapper, resumed: Resumed) -> None:
+        assert resumed.map is not None
+        try:
+            mapper.restore(resumed.map, resumed.frames)
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise ConfigError(
+                f"the saved map of {self.record.session} does not fit this mapper's settings "
+                f"(anchors.children, decoder.hidden and the like must be as they were): {error}"
+            ) from None
+
+    @property
+    def is_working(self) -> bool:
+        """Whether entries wait for the map or a refinement runs."""
+        return self._worker.pending > 0 or self._worker.job.is_running
 
     def opening(self) -> OpenReply:
         """What whoever opens the session is told."""
@@ -137,7 +152,7 @@ class Session:
         return self._worker.refine(request.iterations)
 
     def interrupt(self) -> JobStatus:
-        """End a refinement."""
+        """End a refinement; a live map rests until the next entry."""
         return self._worker.interrupt()
 
     def save(self) -> SaveReply:

@@ -117,8 +117,9 @@ class MapWorker:
             return self._job
 
     def interrupt(self) -> JobStatus:
-        """End a refinement after its present iteration."""
+        """End a refinement after its present iteration; a live map rests until an entry comes."""
         with self._changed:
+            self._last_entry_s = -math.inf
             self._job = replace(self._job, is_running=False)
             return self._job
 

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -48,13 +49,14 @@ def endpoint() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def start_at(endpoint) -> Iterator[Callable[[str, Path], subprocess.Popen]]:
+def start_at(endpoint) -> Iterator[Callable[..., subprocess.Popen]]:
     """Starts a mapper of a name on a data folder and waits until it is ready."""
     started = []
 
-    def run(name: str, data: Path) -> subprocess.Popen:
+    def run(name: str, data: Path, *settings: str) -> subprocess.Popen:
         command = [sys.executable, "-m", "services.mapping", "--connect", endpoint]
         command += ["--id", name, "--data", str(data), "--device", "cpu"]
+        command += [word for setting in settings for word in ("--set", setting)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None
@@ -233,3 +235,28 @@ def test_a_new_session_holds_nothing_of_a_removal_that_broke_off(
     opening = opened(bus, calibration)
 
     assert opening.last is None and len(opening.keyframe_poses.seqs) == 0
+
+
+def test_a_session_that_nobody_asks_for_goes_to_disk_and_comes_back(
+    start_at, bus, tmp_path, calibration, entry
+):
+    start_at("tidy", tmp_path, "owner.session_idle_s=0.5")
+    opening = opened(bus, calibration, mapper="tidy")
+    advance(bus, opening, entry(0))
+
+    wait_until_gone(bus, opening)
+    again = opened(bus, mapper="tidy")
+
+    assert again.epoch == opening.epoch + 1
+    assert again.keyframe_poses.seqs.tolist() == [0]
+
+
+def wait_until_gone(bus: Bus, opening: OpenReply) -> None:
+    key = Keys.mapper(opening.mapper, "list")
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        (summary,) = bus.query(key, Empty(), SessionList, 10.0).sessions
+        if not summary.is_open:
+            return
+        time.sleep(0.1)
+    raise AssertionError("still open after a minute without a question")

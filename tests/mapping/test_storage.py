@@ -63,6 +63,15 @@ def test_keyframes_are_counted_without_reading_them(written):
     assert count_keyframes(written) == 2  # 0 and 4
 
 
+def test_zeros_that_a_power_cut_left_at_the_end_are_left_out(written):
+    keyframes = count_keyframes(written)
+    with written.open("ab") as file:
+        file.write(bytes(1000))
+
+    assert len(list(read_log(written))) == 5
+    assert count_keyframes(written) == keyframes
+
+
 def test_a_torn_keyframe_does_not_count(written):
     written.write_bytes(written.read_bytes()[:-1])
 
