@@ -139,13 +139,15 @@ def _machine() -> dict[str, float | str]:
     view, gaussians, pool = _view(640, 480), room(100_000), TimedWorkers(1)
     engine, pixels = Engine(pool, Scratch()), 640 * 480
     frame = engine.prepare(gaussians, view)
+    assert frame.lists is not None
+    tiles = frame.tiles(frame.lists)
     for _ in range(9):
         engine.blend(frame)
     ours_ms, plain_ms = (
         pool.stages_ms()["blend_tiles"],
-        milliseconds(lambda: blend_pixels(frame.tiles()), 3),
+        milliseconds(lambda: blend_pixels(tiles), 3),
     )
-    pairs, peak = blend_pixels(frame.tiles()), peak_gflops()
+    pairs, peak = blend_pixels(tiles), peak_gflops()
     floor_ms = 1e-6 * pairs * FORWARD_FLOPS / peak
     return {
         "processor": platform.processor() or platform.machine(),

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
+from services.mapping.rasterizer import CpuRasterizer, Gaussians, View, binning
 from services.mapping.rasterizer.binning import bin_gaussians, sort_keys
 from services.mapping.rasterizer.kernel_types import (
     REACH,
@@ -14,13 +16,14 @@ from services.mapping.rasterizer.kernel_types import (
     TileLists,
 )
 from services.mapping.rasterizer.projection import project
-from services.mapping.rasterizer.scene import View
 from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import kernel
 from services.mapping.rasterizer.threads import workers
 from shared.camera import Intrinsics
 
 CAMERA = Camera.of(View(np.eye(4), Intrinsics(120.0, 120.0, 79.5, 59.5, 160, 120)))
+
+ALL_TILES = range(CAMERA.tiles())
 
 
 @kernel
@@ -71,7 +74,7 @@ def test_every_pixel_within_an_ellipse_lies_in_a_listed_tile():
     projected = _projected(300)
     records = projected.records.reshape(-1, RECORD)
 
-    lists = bin_gaussians(projected, CAMERA, workers(2), Scratch())
+    lists = bin_gaussians(projected, CAMERA, ALL_TILES, workers(2), Scratch())
 
     columns = -(-CAMERA.width // TILE)
     listed = {
@@ -90,7 +93,7 @@ def test_every_pixel_within_an_ellipse_lies_in_a_listed_tile():
 def test_the_slots_of_a_gaussian_lie_side_by_side_and_each_is_listed_once():
     projected = _projected(5000)
 
-    lists = bin_gaussians(projected, CAMERA, workers(2), Scratch())
+    lists = bin_gaussians(projected, CAMERA, ALL_TILES, workers(2), Scratch())
 
     np.testing.assert_array_equal(lists.owners, np.repeat(np.arange(5000), np.diff(lists.starts)))
     slots = lists.keys & np.uint64(0xFFFFFFFF)
@@ -100,8 +103,43 @@ def test_the_slots_of_a_gaussian_lie_side_by_side_and_each_is_listed_once():
 def test_thin_gaussians_skip_the_tiles_of_their_box_that_they_miss():
     projected = _projected(5000)
 
-    lists = bin_gaussians(projected, CAMERA, workers(1), Scratch())
+    lists = bin_gaussians(projected, CAMERA, ALL_TILES, workers(1), Scratch())
 
     left, right, top, bottom = _boxes(projected)[:, :5000]
     boxed = (right - left + 1).clip(0) * (bottom - top + 1).clip(0)
     assert len(lists.owners) < boxed.sum()
+
+
+def test_ranges_of_tiles_list_the_same_gaussians_as_all_tiles_at_once():
+    projected = _projected(5000)
+    whole = bin_gaussians(projected, CAMERA, ALL_TILES, workers(2), Scratch())
+
+    parts = [
+        bin_gaussians(projected, CAMERA, tiles, workers(2), Scratch())
+        for tiles in (range(7), range(7, 8), range(8, CAMERA.tiles()))
+    ]
+
+    for lists in parts:
+        for tile in range(len(lists.tile_ends)):
+            expected = _owners(whole, lists.first_tile + tile)
+            np.testing.assert_array_equal(_owners(lists, tile), expected)
+
+
+def test_lists_too_long_for_memory_change_nothing_but_the_order_of_sums(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(500, 3, generator=generator) - torch.tensor([0.5, 0.5, -1.0])
+    fields = [means, torch.full((500, 3), 0.1), torch.randn(500, 4, generator=generator)]
+    fields += [torch.full((500,), 0.1), torch.rand(500, 3, generator=generator)]
+    view = View(np.eye(4), Intrinsics(120.0, 120.0, 79.5, 59.5, 160, 120))
+    outcomes = []
+
+    for most in (binning.MOST_PAIRS, 1000):
+        monkeypatch.setattr(binning, "MOST_PAIRS", most)
+        leaves = [field.clone().requires_grad_() for field in fields]
+        rendered = CpuRasterizer(2)(Gaussians(*leaves), view)
+        (rendered.colour.square().sum() + rendered.depth.sum()).backward()
+        outcomes.append((rendered.colour.detach(), *(leaf.grad for leaf in leaves)))
+
+    assert torch.equal(outcomes[0][0], outcomes[1][0])
+    for found, expected in zip(outcomes[1], outcomes[0], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)

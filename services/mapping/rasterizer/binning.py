@@ -7,6 +7,8 @@ chunks do not. Each tile sorts its own list.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from services.mapping.rasterizer.kernel_types import (
@@ -24,41 +26,57 @@ from services.mapping.rasterizer.simd import inlined, kernel
 from services.mapping.rasterizer.threads import Workers
 from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row
 
+# Pairs of a Gaussian and a tile that are listed at once: 76 bytes each with their gradients.
+MOST_PAIRS = 4_000_000
+
+
+def tile_ranges(projected: Projected) -> list[range]:
+    """Cut the tiles into ranges whose lists fit into memory together: nearly always one."""
+    bounds, pairs = [0], 0
+    for tile, count in enumerate(projected.hits.sum(axis=0, dtype=np.int64).tolist()):
+        if pairs + count > MOST_PAIRS and pairs > 0:
+            bounds.append(tile)
+            pairs = 0
+        pairs += count
+    bounds.append(projected.hits.shape[1])
+    return [range(first, stop) for first, stop in pairwise(bounds)]
+
 
 def bin_gaussians(
-    projected: Projected, camera: Camera, pool: Workers, scratch: Scratch
+    projected: Projected, camera: Camera, tiles: range, pool: Workers, scratch: Scratch
 ) -> TileLists:
-    """List the Gaussians of every tile; the lists still lack their order by depth."""
-    chunks, tiles = projected.hits.shape
-    tile_starts = np.empty(tiles + 1, np.int32)
-    slots = np.empty(chunks, np.int64)
-    pairs = _prefix_sums(projected.hits, slots, tile_starts)
+    """List the Gaussians of a range of tiles; the lists still lack their order by depth."""
+    places = projected.hits[:, tiles.start : tiles.stop].copy()
+    tile_starts = np.empty(len(tiles) + 1, np.int32)
+    slots = np.empty(len(places), np.int64)
+    pairs = _prefix_sums(places, slots, tile_starts)
     lists = TileLists(
+        first_tile=tiles.start,
         tile_starts=tile_starts,
-        tile_ends=np.empty(tiles, np.int32),
+        tile_ends=np.empty(len(tiles), np.int32),
         keys=scratch.borrow(pairs, np.uint64),
         starts=scratch.borrow(projected.num_gaussians + 1, np.int32),
         owners=scratch.borrow(pairs, np.int32),
     )
     lists.starts[-1] = pairs
-    pool.run(_scatter, projected, camera.width, slots, lists)
+    pool.run(_scatter, projected, camera.width, (places, slots), lists)
     return lists
 
 
 @kernel
-def _prefix_sums(hits, slots, tile_starts):
+def _prefix_sums(places, slots, tile_starts):
     """Turn counts into first places, in place, and find each chunk's first slot.
 
     Gives the number of pairs.
     """
-    chunks, tiles = hits.shape
+    chunks, tiles = places.shape
     slots[:] = 0
     place = 0
     for tile in range(tiles):
         tile_starts[tile] = place
         for chunk in range(chunks):
-            count = hits[chunk, tile]
-            hits[chunk, tile] = place
+            count = places[chunk, tile]
+            places[chunk, tile] = place
             place += count
             slots[chunk] += count
     tile_starts[tiles] = place
@@ -71,30 +89,42 @@ def _prefix_sums(hits, slots, tile_starts):
 
 
 @kernel
-def _scatter(projected, width, slots, lists, counter):
+def _scatter(projected, width, start_of, lists, counter):
     """Write every pair to its tile's list, and each Gaussian's slots, a chunk per count."""
     columns, total = (width + TILE - 1) // TILE, projected.num_gaussians
-    depth_bits = projected.records.view(np.uint32)
+    all_places, slots = start_of
     while True:
         chunk = fetch_add(counter, 0, 1)
         start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, total)
         if start >= stop:
             return
-        slot, places = slots[chunk], projected.hits[chunk]
+        slot, places = slots[chunk], all_places[chunk]
         for i in range(start, stop):
             lists.starts[i] = slot
-            depth = np.uint64(depth_bits[i * RECORD + DEPTH]) << np.uint64(32)
-            left, right, top, bottom = tile_box(projected.boxes, i)
-            for row in range(top, bottom + 1):
-                first, last = left, right
-                if left < right and top < bottom:
-                    first, last = tiles_of_row(projected.records, i, row, left, right)
-                for column in range(first, last + 1):
-                    place = places[row * columns + column]
-                    places[row * columns + column] = place + 1
-                    lists.keys[place] = depth | np.uint64(slot)
-                    lists.owners[slot] = i
-                    slot += 1
+            slot = _scatter_one(projected, i, columns, (places, lists), slot)
+
+
+@inlined
+def _scatter_one(projected, i, columns, target, slot):
+    """Write the pairs of a Gaussian; gives the next free slot."""
+    places, lists = target
+    bits = projected.records.view(np.uint32)[i * RECORD + DEPTH]
+    depth = np.uint64(bits) << np.uint64(32)
+    left, right, top, bottom = tile_box(projected.boxes, i)
+    for row in range(top, bottom + 1):
+        first, last = left, right
+        if left < right and top < bottom:
+            first, last = tiles_of_row(projected.records, i, row, left, right)
+        # Only the columns whose tiles lie in the range.
+        first = max(first, lists.first_tile - row * columns)
+        last = min(last, lists.first_tile + len(places) - 1 - row * columns)
+        for tile in range(row * columns + first, row * columns + last + 1):
+            place = places[tile - lists.first_tile]
+            places[tile - lists.first_tile] = place + 1
+            lists.keys[place] = depth | np.uint64(slot)
+            lists.owners[slot] = i
+            slot += 1
+    return slot
 
 
 @inlined

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from services.mapping.rasterizer.binning import bin_gaussians
+from services.mapping.rasterizer.binning import bin_gaussians, tile_ranges
 from services.mapping.rasterizer.kernel_types import (
     CHUNK,
     RECORD,
@@ -22,7 +23,12 @@ from services.mapping.rasterizer.kernel_types import (
     Tiles,
 )
 from services.mapping.rasterizer.projection import project
-from services.mapping.rasterizer.projection_backward import Gradients, Pairs, project_backward
+from services.mapping.rasterizer.projection_backward import (
+    Gradients,
+    Pairs,
+    add_sums,
+    project_backward,
+)
 from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
 from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import LANES
@@ -48,7 +54,7 @@ class CpuRasterizer:
         """
         gaussians.check()
         frame = self._engine.prepare(gaussians, view)
-        screen = ScreenStatistics(torch.from_numpy(np.diff(frame.lists.starts) > 0))
+        screen = ScreenStatistics(torch.from_numpy(frame.projected.visible()))
         run = _Run(self._engine, frame, screen)
         images = _Rasterize.apply(*gaussians.tensors(), view.pose(), run)
         return Rendered(*images, screen=screen)
@@ -56,15 +62,20 @@ class CpuRasterizer:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Gaussians projected to one view and sorted into its tiles."""
+    """Gaussians projected to one view and sorted into its tiles.
+
+    Where the lists of all tiles are too long to keep, there are several ranges of tiles, and
+    each pass makes the lists of a range when it comes to it.
+    """
 
     splats: Splats
     camera: Camera
     projected: Projected
-    lists: TileLists
+    ranges: list[range]
+    lists: TileLists | None  # None if there are several ranges
 
-    def tiles(self) -> Tiles:
-        return Tiles(self.projected.records, self.lists, self.camera)
+    def tiles(self, lists: TileLists) -> Tiles:
+        return Tiles(self.projected.records, lists, self.camera)
 
 
 @dataclass(frozen=True)
@@ -81,24 +92,58 @@ class Engine:
         self.pool.run(project, splats, camera, projected)
         if not projected.valid.all():
             gaussians.check_finite()
-        lists = bin_gaussians(projected, camera, self.pool, self.scratch)
-        return _Frame(splats, camera, projected, lists)
+        ranges = tile_ranges(projected)
+        lists = None
+        if len(ranges) == 1:
+            lists = bin_gaussians(projected, camera, ranges[0], self.pool, self.scratch)
+        return _Frame(splats, camera, projected, ranges, lists)
 
     def blend(self, frame: _Frame) -> tuple[Tensor, Tensor, Tensor]:
         height, width = frame.camera.height, frame.camera.width
-        borrow, pixels = self.scratch.borrow, height * width
-        images = Images(borrow(3 * pixels), borrow(pixels), borrow(pixels))
-        self.pool.run(blend_tiles, frame.tiles(), images)
+        images = self._empty_images(frame)
+        for _ in self._blend_ranges(frame, images):
+            pass
         colour, depth, alpha = (torch.from_numpy(image) for image in images)
         return colour.view(height, width, 3), depth.view(height, width), alpha.view(height, width)
 
     def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
-        sums = self.scratch.borrow(len(frame.lists.owners) * RECORD)
-        self.pool.run(blend_tiles_backward, frame.tiles(), images, gradients, sums)
+        if frame.lists is None:
+            pairs = self._sum_ranges(frame, images, gradients)
+        else:
+            pairs = self._sum_pairs(frame, frame.lists, images, gradients)
         result = _empty_gradients(frame.projected.num_gaussians, self.scratch)
-        pairs = Pairs(frame.lists.starts, sums)
         self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
         return result
+
+    def _empty_images(self, frame: _Frame) -> Images:
+        borrow, pixels = self.scratch.borrow, frame.camera.height * frame.camera.width
+        return Images(borrow(3 * pixels), borrow(pixels), borrow(pixels))
+
+    def _blend_ranges(self, frame: _Frame, images: Images) -> Iterator[TileLists]:
+        """Blend each range of tiles; gives its sorted lists."""
+        for tiles in frame.ranges:
+            lists = frame.lists or bin_gaussians(
+                frame.projected, frame.camera, tiles, self.pool, self.scratch
+            )
+            self.pool.run(blend_tiles, frame.tiles(lists), images)
+            yield lists
+
+    def _sum_pairs(
+        self, frame: _Frame, lists: TileLists, images: Images, gradients: Images
+    ) -> Pairs:
+        sums = self.scratch.borrow(len(lists.owners) * RECORD)
+        self.pool.run(blend_tiles_backward, frame.tiles(lists), images, gradients, sums)
+        return Pairs(lists.starts, sums)
+
+    def _sum_ranges(self, frame: _Frame, images: Images, gradients: Images) -> Pairs:
+        """One record per visible Gaussian; the lists of a range, gone since, are made again."""
+        visible = frame.projected.visible()
+        starts = np.zeros(len(visible) + 1, np.int32)
+        np.cumsum(visible, out=starts[1:])
+        totals = Pairs(starts, np.zeros(int(starts[-1]) * RECORD, np.float32))
+        for lists in self._blend_ranges(frame, self._empty_images(frame)):
+            self.pool.run(add_sums, self._sum_pairs(frame, lists, images, gradients), totals)
+        return totals
 
 
 @dataclass(frozen=True)

@@ -94,10 +94,16 @@ class Projected(NamedTuple):
             np.empty(chunks, np.uint8),
         )
 
+    def visible(self) -> NDArray[np.bool_]:
+        """Which Gaussians overlap the image, [number of Gaussians]."""
+        first, last, *_ = self.boxes.reshape(4, -1)[:, : self.num_gaussians]
+        return first <= last
+
 
 class TileLists(NamedTuple):
     """Which Gaussians touch which tile. A slot is a (Gaussian, tile) pair."""
 
+    first_tile: int  # lists may be of some tiles only, side by side
     tile_starts: NDArray[np.int32]  # bounds of each tile in `keys`, [tiles + 1]
     tile_ends: NDArray[np.int32]  # where the tile was full, [tiles]
     keys: NDArray[np.uint64]  # bits of the depth, then the slot; a tile's are sorted, [M]

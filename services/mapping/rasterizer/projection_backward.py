@@ -91,6 +91,22 @@ def project_backward(splats, camera, pairs, gradients, counter):
                 _write_nothing(gradients, base)
 
 
+@kernel
+def add_sums(pairs, totals, counter):
+    """Add the gradient records of each Gaussian over its tiles to its one record of `totals`."""
+    while True:
+        chunk = fetch_add(counter, 0, 1)
+        start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, len(pairs.starts) - 1)
+        if start >= stop:
+            return
+        for i in range(start, stop):
+            target = np.int64(totals.starts[i]) * RECORD
+            for slot in range(np.int64(pairs.starts[i]), np.int64(pairs.starts[i + 1])):
+                for k in range(0, RECORD, LANES):
+                    total = load(totals.sums, target + k) + load(pairs.sums, slot * RECORD + k)
+                    store(totals.sums, target + k, total)
+
+
 @inlined
 def _sum_pairs(pairs, base, stop, target):
     """Sum each Gaussian's records over its tiles; gives whether the block has any.

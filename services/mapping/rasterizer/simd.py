@@ -63,7 +63,7 @@ def kernel(function: Callable) -> Any:
     """Compile a function that Python calls; it runs without the interpreter lock.
 
     The compiled code is cached on disk. Numba would renew it only when the function's own file
-    changes, and not when what it inlines does: the stamp covers the whole mapping service.
+    changes, and not when what it inlines does: the stamp covers this whole folder.
     """
     dispatcher: Any = _njit(cache=True, **_OPTIONS)(function)
     cache_file = dispatcher._cache._cache_file
@@ -73,7 +73,7 @@ def kernel(function: Callable) -> Any:
 
 @cache
 def _newest_source_ns() -> int:
-    return max(path.stat().st_mtime_ns for path in Path(__file__).parents[1].rglob("*.py"))
+    return max(path.stat().st_mtime_ns for path in Path(__file__).parent.glob("*.py"))
 
 
 def inlined(function: Callable) -> Any:

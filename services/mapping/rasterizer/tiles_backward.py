@@ -57,7 +57,7 @@ def blend_tiles_backward(tiles, images, gradients, sums, counter):
         index = fetch_add(counter, 0, 1)
         if index >= len(lists.tile_ends):
             return
-        tile = tile_at(index, camera)
+        tile = tile_at(lists.first_tile + index, camera)
         _open_planes(planes, tile, camera.width, images, gradients)
         first, stop = np.int64(lists.tile_starts[index]), np.int64(lists.tile_ends[index])
         _sum_tile(tiles, tile, (first, stop), (planes, strips, spare), sums)

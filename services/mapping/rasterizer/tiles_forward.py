@@ -63,7 +63,7 @@ def blend_tiles(tiles, images, counter):
         index = fetch_add(counter, 0, 1)
         if index >= len(lists.tile_ends):
             return
-        tile = tile_at(index, camera)
+        tile = tile_at(lists.first_tile + index, camera)
         first, stop = np.int64(lists.tile_starts[index]), np.int64(lists.tile_starts[index + 1])
         sort_keys(lists.keys[first:stop], spare, histograms)
         lists.tile_ends[index] = _blend(tiles, tile, (first, stop), planes, strips)
