@@ -5,9 +5,8 @@ Plain torch makes some thirty passes over images that leave the cache.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,14 +14,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from services.mapping.config import LossConfig
-from services.mapping.losses import MIN_DEPTH_ALPHA, Appearance, Loss, Target
+from services.mapping.losses import Appearance, Loss, Target
+from services.mapping.losses_kernels import PIECE, Images, Look, compare, compare_back
 from services.mapping.rasterizer import Rendered
-from services.mapping.workers import in_pieces
+from services.mapping.rasterizer.simd import LANES
+from services.mapping.rasterizer.threads import default_threads, workers
 
 Array = NDArray[np.float32]
-_PIECE = 16384  # pixels
-_MIN_ALPHA = np.float32(MIN_DEPTH_ALPHA)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 def mapping_loss_cpu(
@@ -39,28 +37,6 @@ def mapping_loss_cpu(
     return Loss(total, squared.detach())
 
 
-class _Images(NamedTuple):
-    """Flat images of one comparison."""
-
-    colour: Array  # rendered, [P, 3]
-    depth: Array  # rendered sum of w z, [P]
-    alpha: Array  # [P]
-    true_colour: Array  # [P, 3]
-    true_depth: Array  # [P]
-
-    def part(self, start: int, stop: int) -> _Images:
-        return _Images(*(image[start:stop] for image in self))
-
-
-class _Look(NamedTuple):
-    """How colours come about, and which depth errors count."""
-
-    background: Array  # [3]
-    gain: Array  # [3]
-    bias: Array  # [3]
-    max_depth_error: np.float32
-
-
 class _Compare(torch.autograd.Function):
     """(colour, depth, alpha, exposure) -> (image, mean L1, mean squared error, mean depth L1)."""
 
@@ -68,24 +44,16 @@ class _Compare(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         colour, depth, alpha, exposure, (target, background, max_error) = inputs
         count = alpha.numel()
-        images = _Images(
-            _flat(colour, 3),
-            _flat(depth),
-            _flat(alpha),
-            _flat(target.colour, 3),
-            _flat(target.depth),
-        )
+        columns = (colour, depth, alpha, target.colour, target.depth)
+        images = Images(*map(_whole_vectors, columns), pixels=count)
         gain, bias = exposure.detach().numpy()
-        look = _Look(background, gain, bias, np.float32(max_error))
-        image = np.empty((count, 3), np.float32)
-
-        def work(start: int, stop: int) -> NDArray[np.float64]:
-            return _compare(images.part(start, stop), look, image[start:stop])
-
-        sums = np.sum(in_pieces(work, count, _PIECE), axis=0) / (3 * count, 3 * count, count)
+        look = Look(background, gain, bias, np.float32(max_error))
+        image, sums = np.empty(_room(count) * 3, np.float32), _sums(count)
+        workers(default_threads()).run(compare, images, look, image, sums)
         ctx.images, ctx.look, ctx.shape = images, look, alpha.shape
-        means = torch.from_numpy(sums.astype(np.float32))
-        return torch.from_numpy(image).view(*alpha.shape, 3), means[0], means[1], means[2]
+        total = sums.sum(0, dtype=np.float64)[:3] / (-3 * count, 3 * count, -count)
+        means = torch.from_numpy(total.astype(np.float32))
+        return _image(image, (*alpha.shape, 3)), means[0], means[1], means[2]
 
     @staticmethod
     @once_differentiable
@@ -93,84 +61,34 @@ class _Compare(torch.autograd.Function):
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
         by_image, by_colour, _, by_depth = gradients
-        images, look = ctx.images, ctx.look
-        count = len(images.alpha)
-        upstream = _flat(by_image, 3)
+        count, room = ctx.images.pixels, _room(ctx.images.pixels)
         weights = np.float32(by_colour / (3 * count)), np.float32(by_depth / count)
-        down = (
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.float32),
-            np.empty(count, np.float32),
-        )
-
-        def work(start: int, stop: int) -> NDArray[np.float64]:
-            part = tuple(array[start:stop] for array in down)
-            return _compare_back(
-                images.part(start, stop), look, upstream[start:stop], weights, part
-            )
-
-        by_exposure = np.sum(in_pieces(work, count, _PIECE), axis=0).astype(np.float32)
-        colour, depth, alpha = (torch.from_numpy(array) for array in down)
-        return (
-            colour.view(*ctx.shape, 3),
-            depth.view(ctx.shape),
-            alpha.view(ctx.shape),
-            torch.from_numpy(by_exposure),
-            None,
-        )
+        images = np.empty(room * 3, np.float32), np.empty(room, np.float32)
+        down = *images, np.empty(room, np.float32), _sums(count)
+        slopes = _whole_vectors(by_image), *weights
+        workers(default_threads()).run(compare_back, ctx.images, ctx.look, slopes, down)
+        by_exposure = down[3].sum(0, dtype=np.float64)[:6].astype(np.float32).reshape(2, 3)
+        shapes = (*ctx.shape, 3), ctx.shape, ctx.shape
+        images = (_image(array, shape) for array, shape in zip(down, shapes, strict=False))
+        return *images, torch.from_numpy(by_exposure), None
 
 
-def _flat(image: Tensor, channels: int = 0) -> Array:
-    shape = (-1, channels) if channels else (-1,)
-    return image.detach().contiguous().view(shape).numpy()
+def _room(pixels: int) -> int:
+    """Pixels in whole vectors."""
+    return -(-pixels // LANES) * LANES
 
 
-@numba.njit(inline="always")
-def _depth_error(images, look, i):  # pragma: no cover - compiled
-    """Error of a pixel's depth, metres; 0 where it says nothing."""
-    alpha, truth = images.alpha[i], images.true_depth[i]
-    if not (truth > _ZERO and alpha > _MIN_ALPHA):
-        return _ZERO
-    error = images.depth[i] / alpha - truth
-    return error if abs(error) < look.max_depth_error else _ZERO
+def _sums(pixels: int) -> Array:
+    return np.empty((-(-pixels // PIECE), LANES), np.float32)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _compare(images, look, image):  # pragma: no cover - compiled
-    """Fill `image`; sums of |colour error|, its square, and |depth error|."""
-    colour_sum = squared_sum = depth_sum = 0.0
-    for i in range(len(images.alpha)):
-        rest = _ONE - images.alpha[i]
-        for c in range(3):
-            composite = images.colour[i, c] + rest * look.background[c]
-            value = composite * look.gain[c] + look.bias[c]
-            image[i, c] = value
-            error = value - images.true_colour[i, c]
-            colour_sum += abs(error)
-            squared_sum += error * error
-        depth_sum += abs(_depth_error(images, look, i))
-    return np.array([colour_sum, squared_sum, depth_sum])
+def _whole_vectors(image: Tensor) -> Array:
+    """The image, flat; a copy with zeros behind it where its pixels do not fill vectors."""
+    flat = image.detach().contiguous().numpy().reshape(-1)
+    pixels = image.shape[0] * image.shape[1]
+    spare = (_room(pixels) - pixels) * flat.size // pixels
+    return np.pad(flat, (0, spare)) if spare else flat
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _compare_back(images, look, upstream, weights, down):  # pragma: no cover - compiled
-    """Fill the gradients at colour, depth and alpha; sums of those at gain and bias, [2, 3]."""
-    by_colour, by_depth, by_alpha = down
-    colour_weight, depth_weight = weights
-    exposure = np.zeros((2, 3))
-    for i in range(len(images.alpha)):
-        alpha_gradient = _ZERO
-        for c in range(3):
-            composite = images.colour[i, c] + (_ONE - images.alpha[i]) * look.background[c]
-            error = composite * look.gain[c] + look.bias[c] - images.true_colour[i, c]
-            gradient = upstream[i, c] + np.float32(np.sign(error)) * colour_weight
-            exposure[0, c] += gradient * composite
-            exposure[1, c] += gradient
-            gradient *= look.gain[c]
-            by_colour[i, c] = gradient
-            alpha_gradient -= gradient * look.background[c]
-        slope = np.float32(np.sign(_depth_error(images, look, i))) * depth_weight
-        share = slope / max(images.alpha[i], _MIN_ALPHA)
-        by_depth[i] = share
-        by_alpha[i] = alpha_gradient - share * images.depth[i] / max(images.alpha[i], _MIN_ALPHA)
-    return exposure
+def _image(array: Array, shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(array[: int(np.prod(shape))].reshape(shape))

@@ -42,15 +42,18 @@ def target(image) -> Target:
     return Target.of(image, torch.device("cpu"))
 
 
-def test_the_cpu_loss_and_its_gradients_equal_the_plain_ones(image):
+@pytest.mark.parametrize("size", [(16, 20), (15, 19)])  # the latter fills no whole vectors
+def test_the_cpu_loss_and_its_gradients_equal_the_plain_ones(image, size):
     generator = torch.Generator().manual_seed(0)
-    holes = image.depth_m.copy()
+    height, width = size
+    holes = image.depth_m[:height, :width].copy()
     holes[3:6] = 0.0
-    target = Target.of(replace(image, depth_m=holes), torch.device("cpu"))
+    rgb = image.rgb[:height, :width].copy()
+    target = Target.of(replace(image, rgb=rgb, depth_m=holes), torch.device("cpu"))
     results = []
     for function in (mapping_loss, mapping_loss_cpu):
         generator.manual_seed(0)
-        shapes = (16, 20, 3), (16, 20), (16, 20), (2, 3)
+        shapes = (*size, 3), size, size, (2, 3)
         leaves = [torch.rand(shape, generator=generator).requires_grad_() for shape in shapes]
         rendered = Rendered(leaves[0], leaves[1] * 2, leaves[2], perfect(image).screen)
         appearance = Appearance(torch.tensor([0.2, 0.4, 0.6]), leaves[3])
