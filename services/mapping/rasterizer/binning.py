@@ -93,6 +93,7 @@ def _scatter(projected, width, start_of, lists, counter):
     """Write every pair to its tile's list, and each Gaussian's slots, a chunk per count."""
     columns, total = (width + TILE - 1) // TILE, projected.num_gaussians
     all_places, slots = start_of
+    depth_bits = projected.records.view(np.uint32)
     while True:
         chunk = fetch_add(counter, 0, 1)
         start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, total)
@@ -101,15 +102,15 @@ def _scatter(projected, width, start_of, lists, counter):
         slot, places = slots[chunk], all_places[chunk]
         for i in range(start, stop):
             lists.starts[i] = slot
-            slot = _scatter_one(projected, i, columns, (places, lists), slot)
+            depth = np.uint64(depth_bits[i * RECORD + DEPTH]) << np.uint64(32)
+            slot = _scatter_one(projected, (i, depth), columns, (places, lists), slot)
 
 
 @inlined
-def _scatter_one(projected, i, columns, target, slot):
+def _scatter_one(projected, gaussian, columns, target, slot):
     """Write the pairs of a Gaussian; gives the next free slot."""
     places, lists = target
-    bits = projected.records.view(np.uint32)[i * RECORD + DEPTH]
-    depth = np.uint64(bits) << np.uint64(32)
+    i, depth = gaussian
     left, right, top, bottom = tile_box(projected.boxes, i)
     for row in range(top, bottom + 1):
         first, last = left, right

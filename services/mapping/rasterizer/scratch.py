@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+CACHE_LINE = 64  # bytes; a record that straddled two would cost two
 _MOST = 48  # arrays kept; two forward and backward passes have fewer
 
 
@@ -26,7 +27,10 @@ class Scratch:
         self._free: deque[NDArray[np.uint8]] = deque(maxlen=_MOST)
 
     def borrow(self, size: int, dtype: DTypeLike = np.float32) -> NDArray[Any]:
-        """An array of `size` numbers that nobody else has, contents arbitrary."""
+        """An array of `size` numbers that nobody else has, contents arbitrary.
+
+        It starts at a cache line.
+        """
         num_bytes = size * np.dtype(dtype).itemsize
         memory = self._take(num_bytes)
         # Not a slice: views of it must keep alive what the finalizer watches, not its owner.
@@ -44,4 +48,5 @@ class Scratch:
             if num_bytes <= memory.size <= 2 * num_bytes + 4096:
                 return memory
             self._free.append(memory)
-        return np.empty(num_bytes + num_bytes // 4, np.uint8)
+        memory = np.empty(num_bytes + num_bytes // 4 + CACHE_LINE, np.uint8)
+        return memory[-memory.ctypes.data % CACHE_LINE :]
