@@ -57,13 +57,22 @@ class SynthOptions:
 def write_sequence(
     folder: Path, options: SynthOptions, progress: Callable[[int], None] = lambda done: None
 ) -> None:
-    """Render a room into `folder`: images, lists, truth, calibration and views off the path.
+    """Render the seed's room into `folder`; `progress` is called with the number of images done."""
+    record_scene(folder, lit_room(options.seed), options, progress)
 
-    Args:
-        progress: called with the number of images done.
-    """
-    threads = os.cpu_count() or 1
-    scene = pack_scene(bake_light(build_room(options.seed), options.seed, threads))
+
+def lit_room(seed: int) -> Scene:
+    """The room of a seed with its light, which takes seconds to bake."""
+    return pack_scene(bake_light(build_room(seed), seed, os.cpu_count() or 1))
+
+
+def record_scene(
+    folder: Path,
+    scene: Scene,
+    options: SynthOptions,
+    progress: Callable[[int], None] = lambda done: None,
+) -> None:
+    """Render a scene into `folder`: images, lists, truth, calibration and views off the path."""
     path = camera_path(options.num_frames)
     views = views_off_path(path, options.num_views, options.seed)
     exact = SynthOptions(camera=options.camera, seed=options.seed, noise=Noise.NONE)
@@ -74,7 +83,7 @@ def write_sequence(
     for target in (folder, folder / "novel"):
         for kind in ("rgb", "depth"):
             (target / kind).mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         written = pool.map(lambda job: _write_frame(scene, *job), jobs)
         for done, _ in enumerate(written, 1):
             progress(done)

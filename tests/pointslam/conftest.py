@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pointslam.datasets import FileSequence, open_sequence
-from pointslam.synth import Noise, SynthOptions, write_sequence
+from pointslam.synth import Noise, SynthOptions, record_scene
 from shared.camera import Intrinsics
 
 ROOM = SynthOptions(
@@ -28,10 +28,10 @@ def room_options() -> SynthOptions:
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory) -> FileSequence:
+def room(tmp_path_factory, lit_scene) -> FileSequence:
     """A small procedural sequence without noise."""
     folder = tmp_path_factory.mktemp("synth") / "room"
-    write_sequence(folder, ROOM)
+    record_scene(folder, lit_scene, ROOM)
     return open_sequence(folder)
 
 

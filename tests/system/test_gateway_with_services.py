@@ -13,8 +13,7 @@ import pytest
 from benchmarks import gateway as gateway_benchmark
 from pointslam.client import Client
 from pointslam.datasets import open_sequence
-from pointslam.launcher import LaunchOptions, Services
-from pointslam.synth import Noise, SynthOptions, write_sequence
+from pointslam.synth import Noise, SynthOptions, record_scene
 from shared.camera import Intrinsics
 from shared.errors import InputError
 from shared.frames import DepthImage, TrackingStatus
@@ -31,17 +30,10 @@ ROOM = SynthOptions(
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
+def room(tmp_path_factory, lit_scene):
     folder = tmp_path_factory.mktemp("synth") / "room"
-    write_sequence(folder, ROOM)
+    record_scene(folder, lit_scene, ROOM)
     return open_sequence(folder)
-
-
-@pytest.fixture(scope="module")
-def services(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("services")
-    with Services(LaunchOptions(folder / "data", folder / "logs")) as services:
-        yield services
 
 
 @pytest.fixture

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from pointslam.cli import main
-from pointslam.launcher import LaunchOptions, Services
 from pointslam.run import RunOptions, evaluate_run, run_sequence
 from pointslam.run_folder import RunFolder
-from pointslam.synth import SynthOptions, write_sequence
+from pointslam.synth import SynthOptions, record_scene
 from shared.camera import Intrinsics
 
 pytestmark = pytest.mark.system
@@ -23,9 +22,10 @@ NUM_FRAMES = 14
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory) -> Path:
+def sequence(tmp_path_factory, lit_scene) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "room"
-    write_sequence(folder, SynthOptions(num_frames=NUM_FRAMES, num_views=2, camera=SMALL))
+    options = SynthOptions(num_frames=NUM_FRAMES, num_views=2, camera=SMALL)
+    record_scene(folder, lit_scene, options)
     return folder
 
 
@@ -37,13 +37,6 @@ def options(sequence, tmp_path_factory) -> RunOptions:
 @pytest.fixture(scope="module")
 def metrics(options):
     return run_sequence(options)
-
-
-@pytest.fixture(scope="module")
-def services(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("services")
-    with Services(LaunchOptions(folder / "data", folder / "logs", device="cpu")) as started:
-        yield started
 
 
 def test_every_frame_is_tracked_to_millimetres(metrics):

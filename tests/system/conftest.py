@@ -1,0 +1,17 @@
+"""One set of real services for all tests that leave them healthy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from pointslam.launcher import LaunchOptions, Services
+
+
+@pytest.fixture(scope="session")
+def services(tmp_path_factory) -> Iterator[Services]:
+    """A router, a gateway, two trackers and a mapper; who kills one of them restarts it."""
+    folder = tmp_path_factory.mktemp("services")
+    with Services(LaunchOptions(folder / "data", folder / "logs", device="cpu")) as started:
+        yield started
