@@ -19,9 +19,8 @@ from pointslam.evaluation.metrics import (
 )
 from pointslam.evaluation.protocol import EvaluationOutput, Scores, score_run
 from pointslam.evaluation.report import write_report
-from pointslam.evaluation.trajectory import Poses
 from pointslam.run_folder import RunFolder, RunRecord, tum_lines
-from shared.frames import HAS_POSE
+from shared.frames import HAS_POSE, TrackingStatus
 from shared.se3 import Matrix
 
 
@@ -33,6 +32,8 @@ class Evaluation:
     final: dict[int, Matrix]
     trajectories: TrajectoryScores
     images: Scores
+    keyframes: tuple[int, ...] = ()
+    lost: tuple[Matrix, ...] = ()  # the poses last known where frames were lost
 
     def entries(self, holdout: int) -> dict[str, Any]:
         """What metrics.json holds of it."""
@@ -47,15 +48,18 @@ def evaluate_session(
     progress: Callable[[int, int], None],
 ) -> Evaluation:
     """Fetch poses and views of a session and score them; pictures go to the run's folder."""
-    records = [r for r in session.trajectory() if r.status in HAS_POSE]
-    online = {r.seq: r.T_map_camera_online for r in records}
-    final = {r.seq: r.T_map_camera_final for r in records}
+    records = session.trajectory()
+    with_pose = [r for r in records if r.status in HAS_POSE]
+    online = {r.seq: r.T_map_camera_online for r in with_pose}
+    final = {r.seq: r.T_map_camera_final for r in with_pose}
     trajectories = score_trajectories(sequence, online, final)
     T_truth_map = trajectories.final.T_truth_map if trajectories.final else None
     folder.renders.mkdir(parents=True, exist_ok=True)
     output = EvaluationOutput(folder.renders, holdout, progress)
     images = score_run(session, sequence, final, T_truth_map, output)
-    return Evaluation(online, final, trajectories, images)
+    keyframes = tuple(r.seq for r in with_pose if r.keyframe)
+    lost = tuple(r.T_map_camera_online for r in records if r.status is TrackingStatus.LOST)
+    return Evaluation(online, final, trajectories, images, keyframes, lost)
 
 
 def write_evaluation(
@@ -72,17 +76,19 @@ def write_evaluation(
         folder.trajectory(kind).write_text(tum_lines(stamps, [poses[i] for i in indices]))
     folder.write_metrics(metrics)
     pictures = sorted(folder.renders.glob("*.png"))
-    write_report(folder.report, metrics, _plots(sequence, record, evaluation), pictures)
+    pages = _plots(sequence, record, evaluation)
+    stages = metrics["tracking_ms"]["stages"], metrics["mapping_ms_per_iteration"]["stages"]
+    if any(stages):
+        pages.append(plots.stages_plot(*stages))
+    write_report(folder.report, metrics, pages, pictures)
 
 
 def _plots(sequence: Sequence, record: RunRecord, evaluation: Evaluation) -> list[bytes]:
     pages = []
-    trajectories, final = evaluation.trajectories, evaluation.final
-    if final:
-        T = trajectories.final.T_truth_map if trajectories.final else np.eye(4)
-        pages.append(plots.trajectory_plot(final, _truth(sequence, final), T))
-    if trajectories.final is not None:
-        pages.append(plots.error_plot(trajectories))
+    if evaluation.final:
+        pages.append(plots.trajectory_plot(_track(sequence, evaluation)))
+    if evaluation.trajectories.final is not None:
+        pages.append(plots.error_plot(evaluation.trajectories))
     if evaluation.images.frames:
         pages.append(plots.psnr_plot(evaluation.images, lambda i: is_held_out(i, record.holdout)))
     if record.frame_ms:
@@ -90,6 +96,11 @@ def _plots(sequence: Sequence, record: RunRecord, evaluation: Evaluation) -> lis
     return pages
 
 
-def _truth(sequence: Sequence, poses: Poses) -> dict[int, Matrix]:
-    known = {i: sequence.truth(i) for i in poses}
-    return {i: T for i, T in known.items() if T is not None}
+def _track(sequence: Sequence, evaluation: Evaluation) -> plots.Track:
+    scores = evaluation.trajectories.final
+    T_truth_map = scores.T_truth_map if scores else np.eye(4)
+    estimated = {i: T_truth_map @ T for i, T in evaluation.final.items()}
+    known = {i: sequence.truth(i) for i in estimated}
+    truth = {i: T for i, T in known.items() if T is not None}
+    lost = np.array([(T_truth_map @ T)[:3, 3] for T in evaluation.lost]).reshape(-1, 3)
+    return plots.Track(estimated, truth, evaluation.keyframes, lost)

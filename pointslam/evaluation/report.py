@@ -11,11 +11,17 @@ from typing import Any
 import cv2
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1100px; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; }
-td, th { padding: .25rem .9rem .25rem 0; text-align: left; border-bottom: 1px solid #ddd; }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; color: #222;
+  padding: 0 1rem; }
+main { display: grid; gap: 1.5rem; align-items: start;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); }
+h2 { margin: 2.5rem 0 1rem; }
+table { border-collapse: collapse; width: 100%; }
+td { padding: .2rem .9rem .2rem 0; vertical-align: top; border-bottom: 1px solid #ddd; }
+td:first-child { color: #666; white-space: nowrap; }
 td:nth-child(2) { font-variant-numeric: tabular-nums; }
-figure { margin: 1rem 0; } figcaption { color: #666; } img { max-width: 100%; }
+figure { margin: 0; } img { width: 100%; display: block; }
+figcaption { display: flex; color: #666; } figcaption span { flex: 1; }
 """
 
 
@@ -67,22 +73,31 @@ def write_report(
         f"<tr><td>{html.escape(row.name)}</td><td>{html.escape(row.value)}</td></tr>"
         for row in table_rows(metrics)
     )
-    figures = "".join(_figure("image/png", data, "") for data in plots)
+    figures = "".join(_figure("image/png", data, ()) for data in plots)
     views = "".join(
-        _figure("image/jpeg", _jpeg(picture), f"{picture.stem}: rendered | true")
+        _figure("image/jpeg", _jpeg(picture), (f"{_view_name(picture)}: rendered", "truth"))
         for picture in pictures
     )
     title = html.escape(f"PointSLAM++: {metrics['sequence']}")
     path.write_text(
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{_STYLE}</style></head><body><h1>{title}</h1><table>{rows}</table>"
-        f"{figures}<h2>Views</h2>{views}</body></html>\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_STYLE}</style></head><body><h1>{title}</h1><main><table>{rows}</table>"
+        f"{figures}</main><h2>Views</h2><main>{views}</main></body></html>\n"
     )
 
 
-def _figure(kind: str, data: bytes, caption: str) -> str:
+def _figure(kind: str, data: bytes, captions: tuple[str, ...]) -> str:
+    """An image; its captions share its width."""
     source = f"data:{kind};base64,{base64.b64encode(data).decode()}"
-    return f'<figure><img src="{source}" alt=""><figcaption>{caption}</figcaption></figure>'
+    spans = "".join(f"<span>{html.escape(caption)}</span>" for caption in captions)
+    return f'<figure><img src="{source}" alt=""><figcaption>{spans}</figcaption></figure>'
+
+
+def _view_name(picture: Path) -> str:
+    kind, _, number = picture.stem.partition("_")
+    words = {"frame": "held-out frame", "novel": "novel view"}
+    return f"{words.get(kind, kind)} {int(number)}"
 
 
 def _jpeg(picture: Path) -> bytes:

@@ -21,8 +21,8 @@ from pointslam.evaluation.protocol import EvaluationOutput, score_run
 from pointslam.evaluation.report import text_table
 from pointslam.run_folder import RunFolder, RunRecord
 from pointslam.synth import SynthOptions
-from pointslam.synth.record import pack_scene, render_frame
-from pointslam.synth.room import build_room
+from pointslam.synth.record import render_frame
+from pointslam.synth.scene import Scene
 from shared import se3
 from shared.maps import RenderReply
 
@@ -31,11 +31,11 @@ OPTIONS_OF_READING = SequenceOptions(depth_scale=5208.0)
 
 
 class SceneMap:
-    """A map that shows a procedural scene without its light, in a frame of its own."""
+    """A map that shows a procedural scene in a frame of its own."""
 
-    def __init__(self, options: SynthOptions) -> None:
+    def __init__(self, scene: Scene, options: SynthOptions) -> None:
         self._options = options
-        self._scene = pack_scene(build_room(0))
+        self._scene = scene
 
     def render(self, T_world_camera, intrinsics=None, appearance_t_ns=None) -> RenderReply:
         pose = se3.inverse(T_MAP_WORLD) @ T_world_camera
@@ -44,13 +44,16 @@ class SceneMap:
 
 
 @pytest.fixture(scope="module")
-def evaluation(room, room_options, tmp_path_factory):
+def evaluation(room, lit_scene, room_options, tmp_path_factory):
     poses = {i: T_MAP_WORLD @ room.truth(i) for i in range(len(room)) if i != 7}
     trajectories = score_trajectories(room, poses, poses)
     assert trajectories.final is not None
     output = EvaluationOutput(tmp_path_factory.mktemp("renders"), 8, lambda done, total: None)
-    scores = score_run(SceneMap(room_options), room, poses, trajectories.final.T_truth_map, output)
-    return Evaluation(poses, poses, trajectories, scores), output.folder
+    scores = score_run(
+        SceneMap(lit_scene, room_options), room, poses, trajectories.final.T_truth_map, output
+    )
+    keyframes, lost = (0, 8, 16), (poses[6],)
+    return Evaluation(poses, poses, trajectories, scores, keyframes, lost), output.folder
 
 
 def test_every_frame_with_a_pose_is_scored_once(evaluation):
@@ -87,11 +90,11 @@ def test_pictures_of_held_out_and_novel_views_are_written(evaluation):
     assert {"frame_00004.png", "novel_00000.png"} <= names
 
 
-def test_no_truth_means_no_novel_scores(room, room_options, tmp_path):
+def test_no_truth_means_no_novel_scores(room, lit_scene, room_options, tmp_path):
     output = EvaluationOutput(tmp_path, 8, lambda done, total: None)
     poses = {0: np.eye(4)}
 
-    scores = score_run(SceneMap(room_options), room, poses, None, output)
+    scores = score_run(SceneMap(lit_scene, room_options), room, poses, None, output)
 
     assert image_entries(scores, 8)["novel"]["psnr_db"] is None
 
@@ -106,7 +109,7 @@ def full_metrics(evaluation, room):
         **{"lost": 1, "relocalized": 0, "seed": 0, "wall_s": wall, "input_fps": 34.0},
         **evaluation.entries(8),
         **map_entries(info),
-        "tracking_ms": tracking_entry([], {}),
+        "tracking_ms": tracking_entry([], {"orb": 3.5}),
         "peak_rss_mb": memory_entry(None),
         **provenance(),
     }
@@ -135,7 +138,7 @@ def test_a_runs_folder_gets_trajectories_metrics_and_a_report(evaluation, room, 
     assert len(lines) == 1 + 33
     assert lines[1].startswith("0.000000 ")
     assert json.loads(folder.metrics.read_text())["ate_final_rmse_m"] < 1e-6
-    assert folder.report.read_text().count("data:image/png;base64,") == 4
+    assert folder.report.read_text().count("data:image/png;base64,") == 5
 
 
 def test_the_table_shows_nulls_as_dashes(evaluation, room):
