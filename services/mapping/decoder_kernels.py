@@ -16,7 +16,7 @@ from services.mapping.lane_products import (
     fill,
 )
 from services.mapping.rasterizer.memory import fetch_add, load, store
-from services.mapping.rasterizer.simd import LANES, inlined, kernel, maximum, splat
+from services.mapping.rasterizer.simd import LANES, allocating, inlined, kernel, maximum, splat
 
 Array = NDArray[np.float32]
 INPUTS = FEATURES + VIEW
@@ -168,13 +168,13 @@ def _activate(shape, planes):
         store(planes, n, _ONE / (exponential(load(planes, n) * -_ONE) + _ONE))
 
 
-@inlined
+@allocating
 def _write_children(rows, shape, part, planes, out):
     """From planes to Gaussians next to each other."""
     k = shape.children
     start, count = part
     opacity, colour, covariance = head_planes(shape)
-    sizes = np.empty(8, np.float32)
+    sizes = np.empty(LANES, np.float32)
     for n in range(count):
         a = start + n
         sizes_of(rows, a, sizes)
@@ -193,7 +193,7 @@ def _write_children(rows, shape, part, planes, out):
 
 @inlined
 def sizes_of(rows, anchor, sizes):
-    """exp of an anchor's scalings, in the first six of eight."""
+    """exp of an anchor's scalings, in the first six lanes."""
     for c in range(6):
         sizes[c] = rows.scalings[anchor * 6 + c]
     store(sizes, 0, exponential(load(sizes, 0)))

@@ -26,7 +26,7 @@ from services.mapping.lane_products import (
     plane_sums,
 )
 from services.mapping.rasterizer.memory import fetch_add, load, store
-from services.mapping.rasterizer.simd import LANES, inlined, kernel, select, splat
+from services.mapping.rasterizer.simd import LANES, allocating, inlined, kernel, select, splat
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
@@ -52,12 +52,12 @@ def decode_chunks_backward(scene, passed, counter):
         _write_features(planes, _gradient_planes(shape)[1], (start, count), down.features)
 
 
-@inlined
+@allocating
 def _geometry_backward(rows, shape, part, passed, down):
     """Gradients at offsets and scalings; the sizes' shares come with the heads."""
     k = shape.children
     children, upstream = passed
-    sizes = np.zeros(8, np.float32)
+    sizes = np.zeros(LANES, np.float32)
     for a in range(part[0], part[0] + part[1]):
         sizes_of(rows, a, sizes)
         for axis in range(3):
@@ -72,14 +72,14 @@ def _geometry_backward(rows, shape, part, passed, down):
             down.scalings[a * 6 + 3 + axis] = size
 
 
-@inlined
+@allocating
 def _heads_backward(rows, shape, part, passed, planes):
     """Gradients before the activations into the heads' planes; zeros behind the last anchor."""
     k = shape.children
     start, count = part
     children, upstream = passed
     opacity, colour, covariance = head_planes(shape)
-    sizes = np.zeros(8, np.float32)
+    sizes = np.zeros(LANES, np.float32)
     for n in range(count):
         a = start + n
         sizes_of(rows, a, sizes)
@@ -129,7 +129,7 @@ def _layers_backward(networks, shape, planes):
     add_product((networks.skip_weight, 1, 3 * k), planes, (colour, 3 * k), (features, FEATURES))
 
 
-@inlined
+@allocating
 def _weights_backward(shape, planes, chunk, slopes):
     """This chunk's gradients at all weights and biases."""
     k, h = shape.children, shape.hidden

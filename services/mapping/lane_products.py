@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import llvmlite.ir as ir
 import numpy as np
-from numba.core import cgutils
+from numba.core import cgutils, types
 
-from services.mapping.rasterizer.lanes import lane_sums
 from services.mapping.rasterizer.memory import element, load, store
 from services.mapping.rasterizer.simd import (
     LANES,
-    float8,
-    float8_ir,
+    floats,
+    floats_ir,
     inlined,
     intrinsic,
     maximum,
@@ -24,7 +23,7 @@ from services.mapping.rasterizer.simd import (
 )
 
 COLUMNS = 256  # items in a plane
-STRIDE = COLUMNS + 8  # of planes; no power of two, so that columns spread over the cache's sets
+STRIDE = COLUMNS + LANES  # of planes; no power of two, so that columns spread over the cache's sets
 
 _WHOLE = ir.VectorType(ir.IntType(32), LANES)
 _LOG2_E = np.float32(1.44269504)
@@ -49,11 +48,11 @@ def _nearest_whole(typing_context, x):
     """The nearest whole number of every lane, as a float."""
 
     def generate(context, builder, sig, args):
-        kind = ir.FunctionType(float8_ir, [float8_ir])
-        name = "llvm.nearbyint.v8f32"
+        kind = ir.FunctionType(floats_ir, [floats_ir])
+        name = f"llvm.nearbyint.v{LANES}f32"
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
 
-    return float8(x), generate
+    return floats(x), generate
 
 
 @intrinsic
@@ -63,9 +62,22 @@ def _power_of_two(typing_context, x):
     def generate(context, builder, sig, args):
         whole = builder.fptosi(args[0], _WHOLE)
         biased = builder.add(whole, ir.Constant(_WHOLE, [127] * LANES))
-        return builder.bitcast(builder.shl(biased, ir.Constant(_WHOLE, [23] * LANES)), float8_ir)
+        return builder.bitcast(builder.shl(biased, ir.Constant(_WHOLE, [23] * LANES)), floats_ir)
 
-    return float8(x), generate
+    return floats(x), generate
+
+
+@intrinsic
+def lane_sum(typing_context, x):
+    """The sum of all lanes, as a number; added as a tree."""
+
+    def generate(context, builder, sig, args):
+        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), floats_ir])
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, [ir.FloatType()(-0.0), args[0]], fastmath=("reassoc",))
+
+    return types.float32(x), generate
 
 
 @inlined
@@ -107,14 +119,14 @@ def _add_to_five(matrix, planes, source, target):
     """Five planes, two vectors each: ten sums that do not wait for each other."""
     values, step, across = matrix
     at = target[0] * STRIDE + source[2]
-    a0, b0 = load(planes, at), load(planes, at + 8)
-    a1, b1 = load(planes, at + STRIDE), load(planes, at + STRIDE + 8)
-    a2, b2 = load(planes, at + 2 * STRIDE), load(planes, at + 2 * STRIDE + 8)
-    a3, b3 = load(planes, at + 3 * STRIDE), load(planes, at + 3 * STRIDE + 8)
-    a4, b4 = load(planes, at + 4 * STRIDE), load(planes, at + 4 * STRIDE + 8)
+    a0, b0 = load(planes, at), load(planes, at + LANES)
+    a1, b1 = load(planes, at + STRIDE), load(planes, at + STRIDE + LANES)
+    a2, b2 = load(planes, at + 2 * STRIDE), load(planes, at + 2 * STRIDE + LANES)
+    a3, b3 = load(planes, at + 3 * STRIDE), load(planes, at + 3 * STRIDE + LANES)
+    a4, b4 = load(planes, at + 4 * STRIDE), load(planes, at + 4 * STRIDE + LANES)
     for i in range(source[1]):
         place = (source[0] + i) * STRIDE + source[2]
-        x, y = load(planes, place), load(planes, place + 8)
+        x, y = load(planes, place), load(planes, place + LANES)
         w = i * step + target[1] * across
         w0, w1, w2 = (
             element(values, w),
@@ -129,20 +141,20 @@ def _add_to_five(matrix, planes, source, target):
         a4, b4 = a4 + x * w4, b4 + y * w4
     for row, pair in enumerate(((a0, b0), (a1, b1), (a2, b2), (a3, b3), (a4, b4))):
         store(planes, at + row * STRIDE, pair[0])
-        store(planes, at + row * STRIDE + 8, pair[1])
+        store(planes, at + row * STRIDE + LANES, pair[1])
 
 
 @inlined
 def _add_to_one(matrix, planes, source, target):
     values, step, across = matrix
     at = target[0] * STRIDE + source[2]
-    a, b = load(planes, at), load(planes, at + 8)
+    a, b = load(planes, at), load(planes, at + LANES)
     for i in range(source[1]):
         place = (source[0] + i) * STRIDE + source[2]
         w = element(values, i * step + target[1] * across)
-        a, b = a + load(planes, place) * w, b + load(planes, place + 8) * w
+        a, b = a + load(planes, place) * w, b + load(planes, place + LANES) * w
     store(planes, at, a)
-    store(planes, at + 8, b)
+    store(planes, at + LANES, b)
 
 
 @inlined
@@ -151,20 +163,19 @@ def outer_product(planes, left, right, result):
 
     `left` and `right` are (first plane, planes); `result` is the matrix, flat.
     """
-    sums = np.empty(LANES, np.float32)
     for i in range(0, left[1], 2):
         second = min(i + 1, left[1] - 1)
         for j in range(0, right[1], 4):
             rows = (left[0] + i) * STRIDE, (left[0] + second) * STRIDE
-            store(sums, 0, _column_sums(planes, rows, (right[0] + j, right[0] + right[1] - 1)))
+            sums = _column_sums(planes, rows, (right[0] + j, right[0] + right[1] - 1))
             for c in range(min(4, right[1] - j)):
-                result[i * right[1] + j + c] = sums[c]
-                result[second * right[1] + j + c] = sums[c if second == i else 4 + c]
+                result[i * right[1] + j + c] = sums[0][c]
+                result[second * right[1] + j + c] = sums[second - i][c]
 
 
 @inlined
 def _column_sums(planes, rows, columns):
-    """Sums of the products of 2 planes with 4, repeating the last one; 8 lanes."""
+    """Sums of the products of 2 planes with 4, repeating the last one: two rows of four."""
     first, last = columns
     c0, c1 = first * STRIDE, min(first + 1, last) * STRIDE
     c2, c3 = min(first + 2, last) * STRIDE, min(first + 3, last) * STRIDE
@@ -177,16 +188,17 @@ def _column_sums(planes, rows, columns):
         c, d = load(planes, c2 + n), load(planes, c3 + n)
         s00, s01, s02, s03 = s00 + x * a, s01 + x * b, s02 + x * c, s03 + x * d
         s10, s11, s12, s13 = s10 + y * a, s11 + y * b, s12 + y * c, s13 + y * d
-    return lane_sums(s00, s01, s02, s03, s10, s11, s12, s13)
+    return (
+        (lane_sum(s00), lane_sum(s01), lane_sum(s02), lane_sum(s03)),
+        (lane_sum(s10), lane_sum(s11), lane_sum(s12), lane_sum(s13)),
+    )
 
 
 @inlined
 def plane_sums(planes, group, result):
     """The sum of each plane of `group`, (first plane, planes)."""
-    sums = np.empty(LANES, np.float32)
     for p in range(group[1]):
         total = splat(np.float32(0.0))
         for n in range((group[0] + p) * STRIDE, (group[0] + p) * STRIDE + COLUMNS, LANES):
             total = total + load(planes, n)
-        store(sums, 0, total)
-        result[p] = sums.sum()
+        result[p] = lane_sum(total)

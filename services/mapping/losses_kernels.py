@@ -1,4 +1,4 @@
-"""Kernels of `losses_cpu`: composition, L1 and depth error, eight pixels at a time."""
+"""Kernels of `losses_cpu`: composition, L1 and depth error, a vector of pixels at a time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mapping.lane_colours import load_colours, store_colours
 from services.mapping.losses import MIN_DEPTH_ALPHA
-from services.mapping.rasterizer.lanes import lane_sums
 from services.mapping.rasterizer.memory import fetch_add, load, store
+from services.mapping.rasterizer.shuffles import lane_sums, load_three, store_three
 from services.mapping.rasterizer.simd import (
     LANES,
     inlined,
@@ -50,7 +49,7 @@ class Look(NamedTuple):
 
 @kernel
 def compare(images, look, image, sums, counter):
-    """Fill `image`; sums [pieces, 8] of -|colour error|, its square, and -|depth error|."""
+    """Fill `image`; sums [pieces, LANES] of -|colour error|, its square, and -|depth error|."""
     while True:
         piece = fetch_add(counter, 0, 1)
         start, stop = piece * PIECE, min(piece * PIECE + PIECE, images.pixels)
@@ -61,19 +60,19 @@ def compare(images, look, image, sums, counter):
         for i in range(start, stop, LANES):
             is_inside = ramp() < np.float32(stop - i)
             values, errors, _ = _colours(images, look, i, is_inside)
-            store_colours(image, i, values)
+            store_three(image, 3 * i, values)
             for error in errors:
                 colour_sum = colour_sum + negative_magnitude(error)
                 squares = squares + error * error
             error, _ = _depth_error(images, look, i, is_inside)
             depth_sum = depth_sum + negative_magnitude(error)
-        total = lane_sums(colour_sum, squares, depth_sum, zero, zero, zero, zero, zero)
+        total = lane_sums((colour_sum, squares, depth_sum, zero, zero, zero, zero, zero))
         store(sums[piece], 0, total)
 
 
 @kernel
 def compare_back(images, look, slopes, down, counter):
-    """Fill the gradients at colour, depth and alpha; sums [pieces, 8] of those at gain and bias.
+    """Fill the gradients at colour, depth and alpha; sums [pieces, LANES] of gain's and bias's.
 
     `slopes` is (gradient at the image, weight of a colour error, weight of a depth error).
     """
@@ -89,7 +88,7 @@ def compare_back(images, look, slopes, down, counter):
         for i in range(start, stop, LANES):
             is_inside = ramp() < np.float32(stop - i)
             _, errors, composites = _colours(images, look, i, is_inside)
-            u = load_colours(upstream, i)
+            u = load_three(upstream, 3 * i)
             r, g, b = (
                 select(is_inside, u[0] + _sign(errors[0]) * colour_weight, zero),
                 select(is_inside, u[1] + _sign(errors[1]) * colour_weight, zero),
@@ -102,14 +101,14 @@ def compare_back(images, look, slopes, down, counter):
                 gains[2] + b * composites[2],
             )
             r, g, b = r * look.gain[0], g * look.gain[1], b * look.gain[2]
-            store_colours(by_colour, i, (r, g, b))
+            store_three(by_colour, 3 * i, (r, g, b))
             background = look.background
             behind = r * background[0] + g * background[1] + b * background[2]
             error, alpha = _depth_error(images, look, i, is_inside)
             share = _sign(error) * depth_weight / alpha
             store(by_depth, i, share)
             store(by_alpha, i, behind * -_ONE - share * load(images.depth, i) / alpha)
-        total = lane_sums(*gains, *biases, zero, zero)
+        total = lane_sums((*gains, *biases, zero, zero))
         store(sums[piece], 0, total)
 
 
@@ -120,10 +119,10 @@ def _sign(x):
 
 @inlined
 def _colours(images, look, i, is_inside):
-    """Values, errors (zero outside) and composites of 8 pixels, by channel."""
+    """Values, errors (zero outside) and composites of LANES pixels, by channel."""
     rest = _ONE - load(images.alpha, i)
-    r, g, b = load_colours(images.colour, i)
-    truth = load_colours(images.true_colour, i)
+    r, g, b = load_three(images.colour, 3 * i)
+    truth = load_three(images.true_colour, 3 * i)
     r = r + rest * look.background[0]
     g = g + rest * look.background[1]
     b = b + rest * look.background[2]
@@ -140,7 +139,7 @@ def _colours(images, look, i, is_inside):
 
 @inlined
 def _depth_error(images, look, i, is_inside):
-    """Errors of 8 pixels' depth, metres, 0 where they say nothing; and alpha, floored."""
+    """Errors of LANES pixels' depth, metres, 0 where they say nothing; and alpha, floored."""
     alpha, truth = load(images.alpha, i), load(images.true_depth, i)
     floored = maximum(alpha, _MIN_ALPHA)
     error = load(images.depth, i) / floored - truth

@@ -142,6 +142,16 @@ def _lane_sums(builder, vectors: list):
 
 
 @intrinsic
+def lane_sums(typing_context, vectors):
+    """The horizontal sums of a tuple of up to LANES vectors, in its order; 8 of them or more."""
+
+    def generate(context, builder, sig, args):
+        return _lane_sums(builder, cgutils.unpack_tuple(builder, args[0], sig.args[0].count))
+
+    return floats(vectors), generate
+
+
+@intrinsic
 def store_lane_sums(typing_context, array, index, vectors):
     """Write the horizontal sum of each vector of a tuple to a record; the rest is arbitrary."""
 
