@@ -217,6 +217,7 @@ def _stream_and_map(
     if options.refine > 0:
         with progress_bar("refinement") as progress:
             session.refine(options.refine, progress)
+    session.interrupt()  # a live map would go on optimising while it is saved and scored
     return streamed, _Mapped(session.info(), time.monotonic() - start)
 
 

@@ -203,6 +203,10 @@ class AsyncSession:
         async for piece in self._client.download(calls.export_path(self.name), params):
             yield piece
 
+    async def interrupt(self) -> None:
+        """End a refinement; a live map rests until the next frame."""
+        await self._client.call(calls.interrupt(self.name))
+
     async def save(self) -> dict[str, Any]:
         """Write a snapshot; returns when it is on disk."""
         return await self._client.call(calls.save(self.name))

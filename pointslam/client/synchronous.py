@@ -100,9 +100,11 @@ class Client:
                 if not response.is_success:
                     response.read()
                     raise calls.error_from(calls.problem_of(response))
-                with target.open("wb") as file:
+                part = target.with_name(f"{target.name}.part")  # a torn file keeps this name
+                with part.open("wb") as file:
                     for piece in response.iter_bytes():
                         file.write(piece)
+                part.replace(target)
         except httpx.TransportError as error:
             raise _unreachable(self.url, error) from None
 
@@ -214,6 +216,10 @@ class Session:
             is_running, done, total = refinement(self.info())
             if progress is not None:
                 progress(done, total)
+
+    def interrupt(self) -> None:
+        """End a refinement; a live map rests until the next frame."""
+        self._client.call(calls.interrupt(self.name))
 
     def wait_until_mapped(self, progress: Progress | None = None) -> None:
         """Wait until the map has worked through every answered frame."""

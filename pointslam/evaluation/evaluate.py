@@ -52,11 +52,13 @@ def evaluate_session(
     with_pose = [r for r in records if r.status in HAS_POSE]
     online = {r.seq: r.T_map_camera_online for r in with_pose}
     final = {r.seq: r.T_map_camera_final for r in with_pose}
+    # A lost frame is drawn from where the client was told it last was: losing it costs dB.
+    drawn = {r.seq: r.T_map_camera_online for r in records} | final
     trajectories = score_trajectories(sequence, online, final)
     T_truth_map = trajectories.final.T_truth_map if trajectories.final else None
     folder.renders.mkdir(parents=True, exist_ok=True)
     output = EvaluationOutput(folder.renders, holdout, progress)
-    images = score_run(session, sequence, final, T_truth_map, output)
+    images = score_run(session, sequence, drawn, T_truth_map, output)
     keyframes = tuple(r.seq for r in with_pose if r.keyframe)
     lost = tuple(r.T_map_camera_online for r in records if r.status is TrackingStatus.LOST)
     return Evaluation(online, final, trajectories, images, keyframes, lost)

@@ -1,8 +1,9 @@
 """The blocks of metrics.json: which views are scored, from which poses, against which pictures.
 
-all: every tracked frame from its own final pose, no mask. heldout: those of them that were kept
-from training. novel: views off the trajectory, from the true poses brought into the map by the
-alignment of the whole estimated trajectory. gsicp: as `all`, both pictures times (depth > 0).
+all: every answered frame from its own final pose (a lost one from its last known), no mask.
+heldout: those of them that were kept from training. novel: views off the trajectory, from the
+true poses brought into the map by the alignment of the whole estimated trajectory.
+gsicp: as `all`, both pictures times (depth > 0).
 """
 
 from __future__ import annotations
