@@ -58,6 +58,28 @@ def test_metrics_json_has_every_key_of_the_contract(metrics, options):
         assert not below or set(below) <= written[key].keys()
 
 
+def leaves(value):
+    if isinstance(value, dict):
+        return [leaf for part in value.values() for leaf in leaves(part)]
+    return [value]
+
+
+def test_metrics_are_numbers_or_null_but_for_names_and_versions(metrics):
+    figures = {k: v for k, v in metrics.items() if k not in WORDS}
+
+    assert all(v is None or isinstance(v, int | float) for v in leaves(figures))
+    assert all(isinstance(metrics[key], str) for key in ("sequence", "mode"))
+
+
+def test_a_run_of_14_frames_has_every_figure_but_lpips_and_rpe30(metrics):
+    contract = {k: metrics[k] for k in CONTRACT if k not in WORDS}
+    missing = {k for k, v in contract.items() if not isinstance(v, dict) and v is None}
+    missing |= {f"{k}.{p}" for k, parts in CONTRACT.items() for p in parts if metrics[k][p] is None}
+
+    lpips = {f"{block}.lpips" for block in ("all", "heldout", "novel", "gsicp")}
+    assert missing == lpips | {"rpe30_trans_m", "rpe30_rot_deg"}
+
+
 def test_all_outputs_are_written(metrics, options):
     folder = RunFolder(options.out)
     frames = folder.trajectory("online").read_text().splitlines()
@@ -141,6 +163,7 @@ def test_offline_runs_of_a_seed_are_the_same(options, metrics, services, tmp_pat
         assert first.read_text() == second.read_text()
 
 
+WORDS = ("sequence", "mode", "versions", "git_commit")
 IMAGES = ("psnr_db", "ssim", "lpips", "depth_l1_m")
 CONTRACT: dict[str, tuple[str, ...]] = {
     "all": IMAGES,
