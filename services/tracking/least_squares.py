@@ -19,7 +19,7 @@ from services.tracking.orb import Features
 from services.tracking.registration import Registration
 from services.tracking.twists import exp_twist, inverse_rigid, log_twist
 from shared.camera import Intrinsics
-from shared.se3 import inverse, rotate, transform
+from shared.se3 import inverse, transform
 from shared.tracks import Landmarks
 
 
@@ -78,50 +78,34 @@ def refine_pose(
     """
     T = T_start
     camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+    prior = (registration.T_world_camera, registration.information, registration.gradient)
     is_inlier = np.ones(len(observations.depths_m), np.bool_)
     for _ in range(config.rounds):
-        T = _minimise(_Cost(observations, is_inlier, registration, camera, config), T)
+        T = _minimise(
+            _arrays(observations),
+            is_inlier,
+            prior,
+            T,
+            camera,
+            config.huber_sigma,
+            config.iterations,
+        )
         is_inlier = _chi2(observations, T, camera) < config.outlier_chi2
     H, _, _ = linear_system(observations, is_inlier, T, camera, config)
     return Refinement(T, H + registration.information, is_inlier)
 
 
-@dataclass(frozen=True)
-class _Cost:
-    """The features in use, and the prior."""
-
-    observations: PoseObservations
-    is_used: NDArray[np.bool_]
-    registration: Registration
-    camera: NDArray[np.float64]
-    config: RefinementConfig
-
-    def at(self, T: NDArray[np.float64]) -> tuple[NDArray, NDArray, float]:
-        """Normal equations (H, b) and the cost."""
-        H, b, cost = linear_system(self.observations, self.is_used, T, self.camera, self.config)
-        prior = self.registration
-        step = log_twist(inverse_rigid(prior.T_world_camera) @ T)
-        pull = prior.information @ step
-        cost += float(step @ pull) + 2.0 * float(prior.gradient @ step)
-        return H + prior.information, b + pull + prior.gradient, cost
-
-
-def _minimise(cost_of: _Cost, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Levenberg-Marquardt."""
-    damping = 1e-6
-    H, b, cost = cost_of.at(T)
-    for _ in range(cost_of.config.iterations):
-        diagonal = np.diag(np.diag(H) * damping + 1e-9)
-        twist = -np.linalg.solve(H + diagonal, b)
-        T_new = T @ exp_twist(twist)
-        H_new, b_new, cost_new = cost_of.at(T_new)
-        if cost_new > cost:
-            damping *= 10.0
-            continue
-        T, H, b, cost, damping = T_new, H_new, b_new, cost_new, damping * 0.3
-        if np.abs(twist).max() < 1e-6:
-            break
-    return T
+def _arrays(observations: PoseObservations) -> tuple[NDArray[np.float64], ...]:
+    """What the kernels take, in their order."""
+    o = observations
+    return (
+        o.points_world,
+        o.normals_world,
+        o.keypoints_px,
+        o.pixel_sigmas,
+        o.depths_m,
+        o.depth_sigmas_m,
+    )
 
 
 def linear_system(
@@ -132,19 +116,7 @@ def linear_system(
     config: RefinementConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Normal equations (H, b) of a camera twist and the cost, whose gradient is 2 b."""
-    o = observations
-    T_camera_world = inverse_rigid(T)
-    return _accumulate(
-        transform(T_camera_world, o.points_world),
-        rotate(T_camera_world, o.normals_world),
-        o.keypoints_px,
-        o.pixel_sigmas,
-        o.depths_m,
-        o.depth_sigmas_m,
-        is_used,
-        camera,
-        config.huber_sigma,
-    )
+    return _accumulate(_arrays(observations), is_used, T, camera, config.huber_sigma)
 
 
 def _chi2(
@@ -162,21 +134,74 @@ def _chi2(
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(  # noqa: PLR0913 - compiled
-    points, normals, pixels, sigmas, depths, depth_sigmas, is_used, camera, huber
-):
-    """Normal equations of a camera twist and the Huber cost; points and normals of the camera."""
+def _minimise(  # noqa: PLR0913 - compiled
+    observations, is_used, prior, T, camera, huber, iterations
+):  # pragma: no cover - compiled
+    """Levenberg-Marquardt."""
+    T = T.copy()
+    damping = 1e-6
+    H, b, cost = _with_prior(observations, is_used, prior, T, camera, huber)
+    for _ in range(iterations):
+        damped = H.copy()
+        for i in range(6):
+            damped[i, i] += H[i, i] * damping + 1e-9
+        twist = -np.linalg.solve(damped, b)
+        T_new = T @ exp_twist(twist)
+        H_new, b_new, cost_new = _with_prior(observations, is_used, prior, T_new, camera, huber)
+        if cost_new > cost:
+            damping *= 10.0
+            continue
+        T, H, b, cost, damping = T_new, H_new, b_new, cost_new, damping * 0.3
+        if np.abs(twist).max() < 1e-6:
+            break
+    return T
+
+
+@numba.njit(cache=True, nogil=True)
+def _with_prior(  # noqa: PLR0913 - compiled
+    observations, is_used, prior, T, camera, huber
+):  # pragma: no cover - compiled
+    """Normal equations (H, b) and the cost of features and prior together."""
+    H, b, cost = _accumulate(observations, is_used, T, camera, huber)
+    T_prior, information, gradient = prior
+    step = log_twist(inverse_rigid(T_prior) @ T)
+    for i in range(6):
+        pull = 0.0
+        for j in range(6):
+            pull += information[i, j] * step[j]
+            H[i, j] += information[i, j]
+        b[i] += pull + gradient[i]
+        cost += step[i] * (pull + 2.0 * gradient[i])
+    return H, b, cost
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(  # noqa: C901 - compiled
+    observations, is_used, T, camera, huber
+):  # pragma: no cover - compiled
+    """Normal equations of a camera twist and the Huber cost."""
+    points, normals, pixels, sigmas, depths, depth_sigmas = observations
+    V = inverse_rigid(T)
     H = np.zeros((6, 6))
     b = np.zeros(6)
     J = np.zeros((3, 6))
     r = np.zeros(3)
+    y = np.zeros(3)
+    m = np.zeros(3)
     cost = 0.0
     for n in range(len(points)):
-        y = points[n]
-        if not is_used[n] or y[2] < 0.05:
+        if not is_used[n]:
+            continue
+        for i in range(3):
+            y[i] = V[i, 3]
+            m[i] = 0.0
+            for j in range(3):
+                y[i] += V[i, j] * points[n, j]
+                m[i] += V[i, j] * normals[n, j]
+        if y[2] < 0.05:
             continue
         _reprojection_rows(y, pixels[n], sigmas[n], camera, r, J)
-        _plane_row(y, normals[n], pixels[n], depths[n], camera, r, J)
+        _plane_row(y, m, pixels[n], depths[n], camera, r, J)
         r[2] /= depth_sigmas[n]
         for i in range(6):
             J[2, i] /= depth_sigmas[n]
@@ -189,9 +214,13 @@ def _accumulate(  # noqa: PLR0913 - compiled
         for k in range(3):
             s = weight if k < 2 else weight_plane
             for i in range(6):
-                b[i] += s * J[k, i] * r[k]
-                for j in range(6):
-                    H[i, j] += s * J[k, i] * J[k, j]
+                scaled = s * J[k, i]
+                b[i] += scaled * r[k]
+                for j in range(i, 6):
+                    H[i, j] += scaled * J[k, j]
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
     return H, b, cost
 
 

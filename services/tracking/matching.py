@@ -50,7 +50,7 @@ def match_by_projection(
         landmarks.distances_m,
         inverse(T_world_camera),
         np.array([i.fx, i.fy, i.cx, i.cy]),
-        _grid(features.keypoints_px, i),
+        _grid(features.keypoints_px, i.width, i.height),
         features.keypoints_px,
         features.octaves,
         _words(features.descriptors),
@@ -90,25 +90,51 @@ def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
 _CELL_PX = 16
 
 
-def _grid(pixels: NDArray[np.float32], intrinsics: Intrinsics) -> tuple[NDArray, NDArray, int]:
-    """Features by cell: starts [cells + 1], rows in cell order, cells a row of the image."""
-    columns = intrinsics.width // _CELL_PX + 1
-    rows = intrinsics.height // _CELL_PX + 1
-    cells = np.floor(pixels / _CELL_PX).astype(np.int64)
-    cell = np.clip(cells[:, 1], 0, rows - 1) * columns + np.clip(cells[:, 0], 0, columns - 1)
-    order = np.argsort(cell, kind="stable")
-    return np.searchsorted(cell[order], np.arange(rows * columns + 1)), order, columns
-
-
 def _one_to_one(
     best: NDArray[np.int64], distances: NDArray[np.int64], num_features: int
 ) -> Matches:
     """Of the landmarks that want the same feature, the nearest descriptor gets it."""
-    wanting = np.flatnonzero(best >= 0)
-    order = wanting[np.argsort(distances[wanting], kind="stable")]
-    _, first = np.unique(best[order], return_index=True)
-    landmarks = np.sort(order[first])
+    landmarks = np.flatnonzero(_wins(best, distances, num_features))
     return Matches(best[landmarks], landmarks)
+
+
+@numba.njit(cache=True, nogil=True)
+def _wins(best, distances, num_features):  # pragma: no cover - compiled
+    """Which landmarks get the feature they want; the first of equally near ones does."""
+    winners = np.full(num_features, -1, np.int64)
+    wins = np.zeros(len(best), np.bool_)
+    for n in range(len(best)):
+        feature = best[n]
+        if feature < 0:
+            continue
+        rival = winners[feature]
+        if rival < 0 or distances[n] < distances[rival]:
+            if rival >= 0:
+                wins[rival] = False
+            wins[n] = True
+            winners[feature] = n
+    return wins
+
+
+@numba.njit(cache=True, nogil=True)
+def _grid(pixels, width, height):  # pragma: no cover - compiled
+    """Features by cell: starts [cells + 1], rows in cell order, cells a row of the image."""
+    columns, rows = width // _CELL_PX + 1, height // _CELL_PX + 1
+    cells = np.empty(len(pixels), np.int64)
+    starts = np.zeros(rows * columns + 1, np.int64)
+    for n in range(len(pixels)):
+        column = min(max(int(pixels[n, 0] // _CELL_PX), 0), columns - 1)
+        row = min(max(int(pixels[n, 1] // _CELL_PX), 0), rows - 1)
+        cells[n] = row * columns + column
+        starts[cells[n] + 1] += 1
+    for cell in range(rows * columns):
+        starts[cell + 1] += starts[cell]
+    filled = starts.copy()
+    order = np.empty(len(pixels), np.int64)
+    for n in range(len(pixels)):
+        order[filled[cells[n]]] = n
+        filled[cells[n]] += 1
+    return starts, order, columns
 
 
 @numba.njit(cache=True, nogil=True)
@@ -131,6 +157,7 @@ def _search(  # noqa: C901, PLR0913 - compiled
     count = len(positions)
     best = np.full(count, -1, np.int64)
     bits = np.full(count, 257, np.int64)
+    margin = limits[0] * 1.2**4  # the largest radius of a search
     R = T_camera_world
     for n in range(count):
         X = positions[n]
@@ -141,6 +168,8 @@ def _search(  # noqa: C901, PLR0913 - compiled
             continue
         u = camera[0] * x / z + camera[2]
         v = camera[1] * y / z + camera[3]
+        if not (-margin < u < 16 * columns + margin and -margin < v < 16 * rows + margin):
+            continue
         length = np.sqrt(x * x + y * y + z * z)
         # Seen from behind, or at a scale that the pyramid does not reach: not the same patch.
         w = normals[n]

@@ -99,7 +99,7 @@ def _normal_equations(
     source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
     """Hessian, gradient (in depth sigmas), overlap and residual scale at a pose."""
-    residuals, directions = _correspond(
+    residuals, rows = _correspond(
         source.points,
         source.normals,
         T,
@@ -110,13 +110,12 @@ def _normal_equations(
         level.normals,
         np.array([config.min_normal_cos, config.depth_sigma_floor_m, config.depth_sigma_per_m2]),
     )
-    found = np.flatnonzero(np.isfinite(residuals))
-    if len(found) < 30:
+    if len(residuals) < 30:
         return np.zeros((6, 6)), np.zeros(6), 0.0, 1.0
-    scale = 1.4826 * float(np.median(np.abs(residuals[found])))
+    scale = 1.4826 * float(np.median(np.abs(residuals)))
     width = max(config.kernel_width * scale, config.min_kernel_width)
-    H, b = _accumulate(source.points, directions, residuals, found, width)
-    return H, b, len(found) / len(source.points), scale
+    H, b = _accumulate(rows, residuals, width)
+    return H, b, len(residuals) / len(source.points), scale
 
 
 def _well_determined_step(
@@ -132,60 +131,86 @@ def _well_determined_step(
 
 
 @numba.njit(cache=True, nogil=True)
-def _correspond(  # noqa: C901, PLR0913 - compiled
+def _correspond(  # noqa: PLR0913 - compiled
     points, normals, T, size, keys, rows, map_points, map_normals, limits
 ):  # pragma: no cover - compiled
-    """Residual along the map's normal in depth sigmas (NaN: none) and J's first half, scaled."""
-    count = len(points)
-    residuals = np.full(count, np.nan)
-    directions = np.zeros((count, 3))
-    for n in range(count):
-        p, m = points[n], normals[n]
-        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-        nx = T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2]
-        ny = T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2]
-        nz = T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2]
-        cell_x, step_x, reach_x = _cell_and_neighbour(x, size)
-        cell_y, step_y, reach_y = _cell_and_neighbour(y, size)
-        cell_z, step_z, reach_z = _cell_and_neighbour(z, size)
-        first = main_axis(nx, ny, nz)
-        second = _second_axis(nx, ny, nz, first)
-        best = np.inf
-        found = -1
-        for turn in range(2):
-            direction = first if turn == 0 else second
-            if direction < 0:
-                break
-            for corner in range(8):
-                bx, by, bz = corner & 1, (corner >> 1) & 1, corner >> 2
-                if bx * reach_x + by * reach_y + bz * reach_z >= best:
-                    continue  # nothing in that voxel can be nearer
-                key = cell_key(
-                    direction, cell_x + bx * step_x, cell_y + by * step_y, cell_z + bz * step_z
-                )
-                slot = find_slot(keys, key)
-                if keys[slot] == -1:
-                    continue
-                row = rows[slot]
-                q, w = map_points[row], map_normals[row]
-                if nx * w[0] + ny * w[1] + nz * w[2] < limits[0]:
-                    continue
-                distance = (x - q[0]) ** 2 + (y - q[1]) ** 2 + (z - q[2]) ** 2
-                if distance < best:
-                    best = distance
-                    found = row
-        if found < 0 or best > size * size:
+    """Residuals along the map's normal [M] and their rows of the Jacobian [M, 6], depth sigmas."""
+    residuals = np.empty(len(points))
+    rows_J = np.empty((len(points), 6))
+    count = 0
+    for n in range(len(points)):
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        mx, my, mz = normals[n, 0], normals[n, 1], normals[n, 2]
+        nx = T[0, 0] * mx + T[0, 1] * my + T[0, 2] * mz
+        ny = T[1, 0] * mx + T[1, 1] * my + T[1, 2] * mz
+        nz = T[2, 0] * mx + T[2, 1] * my + T[2, 2] * mz
+        found = _nearest_plane(
+            x, y, z, nx, ny, nz, size, keys, rows, map_points, map_normals, limits[0]
+        )
+        if found < 0:
             continue
-        q, w = map_points[found], map_normals[found]
-        sigma = limits[1] + limits[2] * p[2] * p[2]
-        residuals[n] = ((x - q[0]) * w[0] + (y - q[1]) * w[1] + (z - q[2]) * w[2]) / sigma
-        for axis in range(3):
-            directions[n, axis] = (
-                T[0, axis] * w[0] + T[1, axis] * w[1] + T[2, axis] * w[2]
-            ) / sigma
-    return residuals, directions
+        wx, wy, wz = map_normals[found, 0], map_normals[found, 1], map_normals[found, 2]
+        error = (
+            (x - map_points[found, 0]) * wx
+            + (y - map_points[found, 1]) * wy
+            + (z - map_points[found, 2]) * wz
+        )
+        weight = 1.0 / (limits[1] + limits[2] * pz * pz)
+        residuals[count] = weight * error
+        gx = weight * (T[0, 0] * wx + T[1, 0] * wy + T[2, 0] * wz)
+        gy = weight * (T[0, 1] * wx + T[1, 1] * wy + T[2, 1] * wz)
+        gz = weight * (T[0, 2] * wx + T[1, 2] * wy + T[2, 2] * wz)
+        J = rows_J[count]
+        J[0], J[1], J[2] = gx, gy, gz
+        J[3] = py * gz - pz * gy
+        J[4] = pz * gx - px * gz
+        J[5] = px * gy - py * gx
+        count += 1
+    return residuals[:count], rows_J[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_plane(  # noqa: PLR0913 - compiled
+    x, y, z, nx, ny, nz, size, keys, rows, map_points, map_normals, min_cosine
+):  # pragma: no cover - compiled
+    """Row of the nearest plane that faces as the point does, within a voxel's side; -1: none."""
+    cell_x, step_x, reach_x = _cell_and_neighbour(x, size)
+    cell_y, step_y, reach_y = _cell_and_neighbour(y, size)
+    cell_z, step_z, reach_z = _cell_and_neighbour(z, size)
+    first = main_axis(nx, ny, nz)
+    second = _second_axis(nx, ny, nz, first)
+    best = size * size
+    found = -1
+    for turn in range(2):
+        direction = first if turn == 0 else second
+        if direction < 0:
+            break
+        for corner in range(8):
+            bx, by, bz = corner & 1, (corner >> 1) & 1, corner >> 2
+            if bx * reach_x + by * reach_y + bz * reach_z >= best:
+                continue  # nothing in that voxel can be nearer
+            key = cell_key(
+                direction, cell_x + bx * step_x, cell_y + by * step_y, cell_z + bz * step_z
+            )
+            slot = find_slot(keys, key)
+            if keys[slot] == -1:
+                continue
+            row = rows[slot]
+            distance = (
+                (x - map_points[row, 0]) ** 2
+                + (y - map_points[row, 1]) ** 2
+                + (z - map_points[row, 2]) ** 2
+            )
+            if distance >= best:
+                continue
+            cosine = nx * map_normals[row, 0] + ny * map_normals[row, 1] + nz * map_normals[row, 2]
+            if cosine >= min_cosine:
+                best = distance
+                found = row
+    return found
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -215,22 +240,17 @@ def _second_axis(x, y, z, first):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(points, directions, residuals, found, width):  # pragma: no cover - compiled
+def _accumulate(rows, residuals, width):  # pragma: no cover - compiled
     """Normal equations with the Geman-McClure weight."""
     H = np.zeros((6, 6))
     b = np.zeros(6)
-    J = np.zeros(6)
-    for n in found:
-        p, m = points[n], directions[n]
-        J[0], J[1], J[2] = m[0], m[1], m[2]
-        J[3] = p[1] * m[2] - p[2] * m[1]
-        J[4] = p[2] * m[0] - p[0] * m[2]
-        J[5] = p[0] * m[1] - p[1] * m[0]
+    for n in range(len(residuals)):
         weight = 1.0 / (1.0 + (residuals[n] / width) ** 2) ** 2
         for i in range(6):
-            b[i] += weight * J[i] * residuals[n]
+            scaled = weight * rows[n, i]
+            b[i] += scaled * residuals[n]
             for j in range(i, 6):
-                H[i, j] += weight * J[i] * J[j]
+                H[i, j] += scaled * rows[n, j]
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]

@@ -33,13 +33,16 @@ def depth_agreement(
     i = image.intrinsics
     on, front, behind = _compare(
         image.depth_m,
-        cloud_world.points,
-        cloud_world.normals,
+        cloud_world.points[::_CLOUD_STEP],
+        cloud_world.normals[::_CLOUD_STEP],
         inverse(T_world_camera),
         np.array([i.fx, i.fy, i.cx, i.cy]),
         np.array([config.depth_tolerance_m, config.depth_tolerance_per_m2]),
     )
     return Agreement(on / max(1, on + front), on / max(1, on + front + behind), on)
+
+
+_CLOUD_STEP = 4  # a share needs not all of the points
 
 
 @dataclass(frozen=True)
@@ -76,12 +79,12 @@ def _compare(depth, points, normals, T, camera, tolerance):  # noqa: PLR0913 - c
     height, width = depth.shape
     on = front = behind = 0
     for n in range(len(points)):
-        p, m = points[n], normals[n]
-        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         if z < 0.1:
             continue
-        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         u = int(np.floor(camera[0] * x / z + camera[2] + 0.5))
         v = int(np.floor(camera[1] * y / z + camera[3] + 0.5))
         if u < 0 or v < 0 or u >= width or v >= height:
@@ -89,6 +92,7 @@ def _compare(depth, points, normals, T, camera, tolerance):  # noqa: PLR0913 - c
         measured = depth[v, u]
         if measured <= 0.0:
             continue
+        m = normals[n]
         nx = T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2]
         ny = T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2]
         nz = T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2]
