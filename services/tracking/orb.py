@@ -53,7 +53,7 @@ def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
     keypoints, descriptors = orb.detectAndCompute(grey, None)
     if not keypoints:
         return _no_features()
-    pixels = np.array([k.pt for k in keypoints], np.float32)
+    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     octaves = np.array([k.octave for k in keypoints], np.uint8)
     responses = np.array([k.response for k in keypoints], np.float32)
     chosen = spread(pixels, responses, config.cell_px, config.num_features)
@@ -79,14 +79,23 @@ def spread(
     pixels: NDArray[np.float32], responses: NDArray[np.float32], cell_px: int, limit: int
 ) -> NDArray[np.int64]:
     """Indices of up to `limit` keypoints: the best of every cell, then the second best, ..."""
-    cells = np.floor(pixels / cell_px).astype(np.int64)
-    cell = cells[:, 1] * 4096 + cells[:, 0]
-    order = np.lexsort((np.arange(len(cell)), -responses, cell))
-    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
-    lengths = np.diff(np.r_[starts, len(order)])
-    ranks = np.arange(len(order)) - np.repeat(starts, lengths)
-    by_rank = np.lexsort((-responses[order], ranks))
-    return order[by_rank[:limit]]
+    order = np.argsort(-responses, kind="stable")
+    ranks = _ranks_in_cells(pixels[order], cell_px)
+    return order[np.argsort(ranks, kind="stable")[:limit]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _ranks_in_cells(pixels, cell_px):  # pragma: no cover - compiled
+    """How many keypoints before this one lie in the same cell, [M]."""
+    columns = int(pixels[:, 0].max() // cell_px) + 1
+    rows = int(pixels[:, 1].max() // cell_px) + 1
+    counts = np.zeros((rows, columns), np.int32)
+    ranks = np.empty(len(pixels), np.int32)
+    for n in range(len(pixels)):
+        row, column = int(pixels[n, 1] // cell_px), int(pixels[n, 0] // cell_px)
+        ranks[n] = counts[row, column]
+        counts[row, column] += 1
+    return ranks
 
 
 @numba.njit(cache=True, nogil=True)

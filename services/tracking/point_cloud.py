@@ -110,6 +110,9 @@ def _fit_plane(depth, u, v, camera, radius, limits):  # noqa: PLR0913 - compiled
     step = radius // 3
     reach = 3 * step
     inverse = 1.0 / z
+    # Divisions are what a window costs: all but one a pixel are done here.
+    pixel_x, pixel_y, slope = 1.0 / fx, 1.0 / fy, limits[4] * z / fx
+    tolerance = 0.005 * z * z + 0.002
     # Normal equations of 1/z = a x + b y + c over the window, x and y from its centre.
     sxx = sxy = syy = sx = sy = sxr = syr = sr = 0.0
     n = 0
@@ -117,10 +120,10 @@ def _fit_plane(depth, u, v, camera, radius, limits):  # noqa: PLR0913 - compiled
         for uu in range(max(u - reach, u % step), min(u + reach + 1, width), step):
             other = depth[vv, uu]
             du, dv = uu - u, vv - v
-            near = max(abs(du), abs(dv)) * z / fx
-            if other <= 0.0 or abs(other - z) > limits[4] * near + 0.005 * z * z + 0.002:
+            reach_px = max(abs(du), abs(dv))
+            if other <= 0.0 or abs(other - z) > slope * reach_px + tolerance:
                 continue
-            x, y, r = du / fx, dv / fy, 1.0 / other - inverse
+            x, y, r = du * pixel_x, dv * pixel_y, 1.0 / other - inverse
             sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
             sx, sy, sr = sx + x, sy + y, sr + r
             sxr, syr = sxr + x * r, syr + y * r
