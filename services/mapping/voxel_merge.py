@@ -6,7 +6,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.se3 import rotate, transform
 from shared.tracks import PointCloud
 
 
@@ -25,35 +24,47 @@ def merge_clouds(
     Returns:
         one point a voxel and main direction of the normal, in order of first sight.
     """
-    points, normals, weights = [], [], []
-    for cloud, T_world_camera in zip(clouds_camera, T_world_cameras, strict=True):
-        points.append(transform(T_world_camera, cloud.points.astype(np.float64)))
-        normals.append(rotate(T_world_camera, cloud.normals))
-        weights.append(_depth_precision(cloud.points[:, 2]))
     merged_points, merged_normals = _merge_voxels(
-        np.concatenate(points), np.concatenate(normals), np.concatenate(weights), voxel_size_m
+        np.concatenate([cloud.points for cloud in clouds_camera]),
+        np.concatenate([cloud.normals for cloud in clouds_camera]),
+        np.cumsum([len(cloud.points) for cloud in clouds_camera]),
+        np.stack(T_world_cameras),
+        voxel_size_m,
     )
     return PointCloud(merged_points, merged_normals)
 
 
-def _depth_precision(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+@numba.njit(cache=True, nogil=True, inline="always")
+def _depth_precision(depth_m):  # pragma: no cover - compiled
     """Inverse variance of structured-light depth, 1/m^2 (Nguyen et al., 3DIMPVT 2012)."""
-    sigma_m = 0.0012 + 0.0019 * np.square(np.maximum(depth_m - 0.4, 0.0))
-    return (1.0 / np.square(sigma_m)).astype(np.float32)
+    sigma_m = 0.0012 + 0.0019 * max(depth_m - 0.4, 0.0) ** 2
+    return 1.0 / sigma_m**2
 
 
 @numba.njit(cache=True, nogil=True)
-def _merge_voxels(points, normals, weights, voxel_size):  # pragma: no cover - compiled
+def _merge_voxels(  # noqa: C901 - compiled
+    points, normals, ends, poses, voxel_size
+):  # pragma: no cover - compiled
     count = len(points)
+    p, m = np.zeros(3), np.zeros(3)
+    cloud = 0
     capacity = 16
-    while capacity < 2 * count:
+    while capacity <= count:
         capacity *= 2
     keys = np.full(capacity, -1, np.int64)
     slots = np.zeros(capacity, np.int32)
     sums = np.zeros((count, 7), np.float64)
     used = 0
     for i in range(count):
-        key = _voxel_key(points[i], normals[i], voxel_size)
+        while i >= ends[cloud]:
+            cloud += 1
+        for axis in range(3):
+            p[axis] = poses[cloud, axis, 3]
+            m[axis] = 0.0
+            for j in range(3):
+                p[axis] += poses[cloud, axis, j] * points[i, j]
+                m[axis] += poses[cloud, axis, j] * normals[i, j]
+        key = _voxel_key(p, m, voxel_size)
         slot = (key * np.int64(-7046029254386353131)) >> np.int64(20) & np.int64(capacity - 1)
         while keys[slot] != -1 and keys[slot] != key:
             slot = (slot + 1) & (capacity - 1)
@@ -62,10 +73,10 @@ def _merge_voxels(points, normals, weights, voxel_size):  # pragma: no cover - c
             slots[slot] = used
             used += 1
         row = sums[slots[slot]]
-        w = np.float64(weights[i])
+        w = _depth_precision(np.float64(points[i, 2]))
         for axis in range(3):
-            row[axis] += w * points[i, axis]
-            row[3 + axis] += w * normals[i, axis]
+            row[axis] += w * p[axis]
+            row[3 + axis] += w * m[axis]
         row[6] += w
     merged_points = np.empty((used, 3), np.float32)
     merged_normals = np.empty((used, 3), np.float32)

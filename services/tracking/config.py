@@ -53,6 +53,9 @@ class RegistrationConfig:
         lengths = {len(self.voxel_sizes_m), len(self.sample_steps), len(self.max_iterations)}
         if len(lengths) != 1 or not self.voxel_sizes_m:
             raise ConfigError("voxel_sizes_m, sample_steps and max_iterations must match in length")
+        ratios = [size / self.voxel_sizes_m[-1] for size in self.voxel_sizes_m]
+        if any(abs(ratio - round(ratio)) > 1e-6 for ratio in ratios):
+            raise ConfigError("voxel_sizes_m must be multiples of the last")
         _require_positive(self, "depth_sigma_floor_m", "kernel_width", "effective_share")
 
 

@@ -31,12 +31,14 @@ class VoxelMap:
 
 def build_voxel_map(cloud: PointCloud, voxel_sizes_m: tuple[float, ...]) -> VoxelMap:
     """Voxels of a cloud, the same for the same cloud to the bit."""
-    return VoxelMap(tuple(_build_level(cloud, size) for size in voxel_sizes_m))
-
-
-def _build_level(cloud: PointCloud, voxel_size_m: float) -> VoxelLevel:
-    keys, rows, points, normals = _fill(cloud.points, cloud.normals, voxel_size_m)
-    return VoxelLevel(voxel_size_m, keys, rows, points, normals)
+    levels: list[VoxelLevel] = []
+    points, normals = cloud.points, cloud.normals
+    counts = np.ones(len(points), np.float32)
+    # Sizes are multiples of the finest one, so what shares a small voxel shares the larger ones.
+    for size in reversed(voxel_sizes_m):
+        keys, rows, points, directions, normals, counts = _fill(points, normals, counts, size)
+        levels.append(VoxelLevel(size, keys, rows, points, directions))
+    return VoxelMap(tuple(reversed(levels)))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -86,22 +88,22 @@ def _compact(keys, rows, used):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(points, normals, voxel_size):  # pragma: no cover - compiled
+def _fill(points, normals, counts, voxel_size):  # pragma: no cover - compiled
+    """Means of points that stand for `counts` each, with the sums of their normals."""
     count = len(points)
     capacity = 16
-    while capacity < 2 * count:
+    while capacity <= count:
         capacity *= 2
     keys = np.full(capacity, -1, np.int64)
     rows = np.zeros(capacity, np.int32)
     sums = np.zeros((count, 7))
     used = 0
     for n in range(count):
-        p, m = points[n], normals[n]
         key = cell_key(
-            main_axis(m[0], m[1], m[2]),
-            np.floor(p[0] / voxel_size),
-            np.floor(p[1] / voxel_size),
-            np.floor(p[2] / voxel_size),
+            main_axis(normals[n, 0], normals[n, 1], normals[n, 2]),
+            np.floor(points[n, 0] / voxel_size),
+            np.floor(points[n, 1] / voxel_size),
+            np.floor(points[n, 2] / voxel_size),
         )
         slot = find_slot(keys, key)
         if keys[slot] == -1:
@@ -110,16 +112,18 @@ def _fill(points, normals, voxel_size):  # pragma: no cover - compiled
             used += 1
         row = sums[rows[slot]]
         for axis in range(3):
-            row[axis] += p[axis]
-            row[3 + axis] += m[axis]
-        row[6] += 1.0
+            row[axis] += counts[n] * points[n, axis]
+            row[3 + axis] += normals[n, axis]
+        row[6] += counts[n]
     keys, rows = _compact(keys, rows, used)
     means = np.empty((used, 3), np.float32)
     directions = np.empty((used, 3), np.float32)
+    totals = np.empty(used, np.float32)
     for n in range(used):
         row = sums[n]
+        totals[n] = row[6]
         length = np.sqrt(row[3] ** 2 + row[4] ** 2 + row[5] ** 2)
         for axis in range(3):
             means[n, axis] = row[axis] / row[6]
             directions[n, axis] = row[3 + axis] / length
-    return keys, rows, means, directions
+    return keys, rows, means, directions, sums[:used, 3:6].astype(np.float32), totals

@@ -180,6 +180,7 @@ def test_compiled_twists_equal_those_of_shared(scale):
         ("surface", {"stride_px": 0}),
         ("surface", {"max_depth_m": 0.1}),
         ("registration", {"sample_steps": [1, 2]}),
+        ("registration", {"voxel_sizes_m": [0.2, 0.1, 0.07]}),
         ("orb", {"num_features": -1}),
         ("keyframe", {"max_interval": 0}),
         ("surface", {"strides": 4}),

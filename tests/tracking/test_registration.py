@@ -24,6 +24,16 @@ def wall(shift_m: float = 0.0) -> PointCloud:
     return PointCloud(points.astype(np.float32), normals)
 
 
+def test_a_level_built_from_a_finer_one_equals_that_built_from_the_points(room):
+    cloud = cloud_of(room, CORNER)
+
+    from_finer = build_voxel_map(cloud, (0.2, 0.05)).levels[0]
+    from_points = build_voxel_map(cloud, (0.2,)).levels[0]
+
+    np.testing.assert_allclose(from_finer.points, from_points.points, atol=1e-5)
+    np.testing.assert_allclose(from_finer.normals, from_points.normals, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "twist",
     [
