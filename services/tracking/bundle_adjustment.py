@@ -28,7 +28,7 @@ _MAX_DAMPING = 1e6
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Poses, landmarks and what was seen; observations are in ascending order of the landmark."""
+    """Poses, landmarks and what was seen; observations ascend by landmark, then camera."""
 
     T_world_cameras: NDArray[np.float64]  # [K, 4, 4]
     is_fixed: NDArray[np.bool_]  # [K]

@@ -40,7 +40,7 @@ def huber_cost(  # noqa: PLR0913 - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def linearise(  # noqa: PLR0913 - compiled
+def linearise(  # noqa: C901, PLR0913 - compiled
     views, points, camera_index, point_index, measured, sigmas, camera, huber
 ):  # pragma: no cover - compiled
     """Blocks of the normal equations: Hcc, Hpp, Hcp (one an observation), bc, bp."""
@@ -75,11 +75,11 @@ def linearise(  # noqa: PLR0913 - compiled
             Jc[e, 3] = g[e, 1] * y[2] - g[e, 2] * y[1]
             Jc[e, 4] = g[e, 2] * y[0] - g[e, 0] * y[2]
             Jc[e, 5] = g[e, 0] * y[1] - g[e, 1] * y[0]
-        for e in range(3):
+        for e in range(3 if measured[o, 2] > 0.0 else 2):
             for i in range(6):
                 scaled = weights[e] * Jc[e, i]
                 bc[k, i] += scaled * r[e]
-                for j in range(6):
+                for j in range(i, 6):
                     Hcc[k, i, j] += scaled * Jc[e, j]
                 for j in range(3):
                     Hcp[o, i, j] += scaled * Jp[e, j]
@@ -88,6 +88,10 @@ def linearise(  # noqa: PLR0913 - compiled
                 bp[l, i] += scaled * r[e]
                 for j in range(3):
                     Hpp[l, i, j] += scaled * Jp[e, j]
+    for k in range(len(views)):
+        for i in range(6):
+            for j in range(i):
+                Hcc[k, i, j] = Hcc[k, j, i]
     return Hcc, Hpp, Hcp, bc, bp
 
 
@@ -116,7 +120,7 @@ def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
                     for e in range(3):
                         T[i, j] += Hcp[o, i, e] * inverses[l, e, j]
                 b[row + i] -= T[i, 0] * bp[l, 0] + T[i, 1] * bp[l, 1] + T[i, 2] * bp[l, 2]
-            for other in range(starts[l], starts[l + 1]):
+            for other in range(o, starts[l + 1]):  # cameras ascend: the upper blocks
                 column = 6 * camera_index[other]
                 W = Hcp[other]
                 for i in range(6):
@@ -124,6 +128,9 @@ def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
                         S[row + i, column + j] -= (
                             T[i, 0] * W[j, 0] + T[i, 1] * W[j, 1] + T[i, 2] * W[j, 2]
                         )
+    for row in range(6, 6 * count):
+        for column in range(row - row % 6):
+            S[row, column] = S[column, row]
     return S, b, inverses
 
 
