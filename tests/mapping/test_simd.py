@@ -20,6 +20,13 @@ from services.mapping.rasterizer.memory import (
     store_indices,
     strided,
 )
+from services.mapping.rasterizer.places import (
+    round_down,
+    round_up,
+    split_exponent,
+    strip_columns,
+    strip_rows,
+)
 from services.mapping.rasterizer.shuffles import (
     RECORD,
     load_four,
@@ -40,14 +47,9 @@ from services.mapping.rasterizer.simd import (
     minimum,
     negative_magnitude,
     ramp,
-    round_down,
-    round_up,
     select,
     splat,
-    split_exponent,
     square_root,
-    strip_columns,
-    strip_rows,
 )
 
 X = np.resize(np.array([1.5, -2.0, 0.25, 8.0, -0.5, 3.0, 100.0, 7.0], np.float32), LANES)

@@ -14,6 +14,7 @@ from services.mapping.rasterizer.geometry import (
 from services.mapping.rasterizer.kernel_types import CHUNK, CUT, RECORD, TILE
 from services.mapping.rasterizer.lanes import all_lanes
 from services.mapping.rasterizer.memory import fetch_add, store_indices
+from services.mapping.rasterizer.places import round_down, round_up, split_exponent
 from services.mapping.rasterizer.scene import NEAR_M
 from services.mapping.rasterizer.shuffles import load_four, load_three, store_records
 from services.mapping.rasterizer.simd import (
@@ -22,11 +23,8 @@ from services.mapping.rasterizer.simd import (
     kernel,
     maximum,
     minimum,
-    round_down,
-    round_up,
     select,
     splat,
-    split_exponent,
     square_root,
 )
 from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row

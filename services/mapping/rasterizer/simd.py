@@ -79,8 +79,7 @@ def _newest_source_ns() -> int:
 def inlined(function: Callable) -> Any:
     """Compile a function that only kernels call; it vanishes into its caller.
 
-    It must not create or return arrays: it does not count references to them, which in an inner
-    loop would cost more than the loop.
+    It must not create or return arrays: it counts no references, which cost more than the loop.
     """
     return _njit(forceinline=True, _nrt=False, **_OPTIONS)(function)
 
@@ -216,7 +215,7 @@ def splat(typing_context, number):
     return floats(number), generate
 
 
-def _fixed(numbers):
+def fixed(numbers):
     """Signature and code of a constant vector."""
     values = [float(number) for number in numbers]
     return floats(), lambda context, builder, sig, args: _constant(floats_ir, values)
@@ -225,19 +224,7 @@ def _fixed(numbers):
 @intrinsic
 def ramp(typing_context):
     """The lanes 0, 1, 2 ..."""
-    return _fixed(range(LANES))
-
-
-@intrinsic
-def strip_columns(typing_context):
-    """The column of each lane of a strip: 0 to 7, in every row."""
-    return _fixed(lane % STRIP_COLUMNS for lane in range(LANES))
-
-
-@intrinsic
-def strip_rows(typing_context):
-    """The row of each lane of a strip."""
-    return _fixed(lane // STRIP_COLUMNS for lane in range(LANES))
+    return fixed(range(LANES))
 
 
 @intrinsic
@@ -296,7 +283,7 @@ def magnitude(typing_context, x):
     return floats(x), generate
 
 
-def _by_llvm(name: str) -> Callable:
+def by_llvm(name: str) -> Callable:
     """Code that applies an LLVM function to every lane."""
 
     def generate(context, builder, sig, args):
@@ -310,31 +297,4 @@ def _by_llvm(name: str) -> Callable:
 @intrinsic
 def square_root(typing_context, x):
     """The square root of every lane."""
-    return floats(x), _by_llvm("sqrt")
-
-
-@intrinsic
-def round_down(typing_context, x):
-    """The greatest whole number not above each lane."""
-    return floats(x), _by_llvm("floor")
-
-
-@intrinsic
-def round_up(typing_context, x):
-    """The least whole number not below each lane."""
-    return floats(x), _by_llvm("ceil")
-
-
-@intrinsic
-def split_exponent(typing_context, x):
-    """(e, m) of each positive lane x = 2^e m, with m from 0.7071 to 1.4142."""
-
-    def generate(context, builder, sig, args):
-        bits = builder.bitcast(args[0], _INTS)
-        above = builder.sub(bits, _constant(_INTS, [0x3F3504F3] * LANES))
-        exponent = builder.ashr(above, _constant(_INTS, [23] * LANES))
-        rest = builder.sub(bits, builder.shl(exponent, _constant(_INTS, [23] * LANES)))
-        parts = builder.sitofp(exponent, floats_ir), builder.bitcast(rest, floats_ir)
-        return context.make_tuple(builder, sig.return_type, parts)
-
-    return types.UniTuple(floats, 2)(x), generate
+    return floats(x), by_llvm("sqrt")

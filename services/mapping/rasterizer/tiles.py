@@ -31,6 +31,7 @@ from services.mapping.rasterizer.kernel_types import (
 )
 from services.mapping.rasterizer.lanes import ceil_index, floor_index
 from services.mapping.rasterizer.memory import element, prefetch, strided
+from services.mapping.rasterizer.places import strip_columns, strip_rows
 from services.mapping.rasterizer.scene import ALPHA_MAX, TRANSMITTANCE_MIN
 from services.mapping.rasterizer.simd import (
     STRIP_COLUMNS,
@@ -39,8 +40,6 @@ from services.mapping.rasterizer.simd import (
     inlined,
     minimum,
     select,
-    strip_columns,
-    strip_rows,
 )
 
 STRIDE = TILE + STRIP_COLUMNS
