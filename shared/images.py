@@ -31,7 +31,8 @@ def decode_colour(image: ColourImage, size: Intrinsics) -> NDArray[np.uint8]:
     _check_size(decoded, size, "rgb.bytes")
     if decoded.ndim == 2:
         return cv2.cvtColor(decoded, cv2.COLOR_GRAY2RGB).astype(np.uint8)
-    return np.ascontiguousarray(decoded[..., 2::-1])
+    order = cv2.COLOR_BGRA2RGB if decoded.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(decoded, order).astype(np.uint8, copy=False)
 
 
 def decode_depth(image: DepthImage, calibration: Calibration) -> NDArray[np.float32]:
@@ -52,8 +53,8 @@ def decode_depth(image: DepthImage, calibration: Calibration) -> NDArray[np.floa
         raw = _rows(_inflate(image.bytes, 2 * shape[0] * shape[1]), "depth.bytes", np.uint16, shape)
     else:
         raw = _rows(image.bytes, "depth.bytes", np.uint16, shape)
-    depth_m = raw.astype(np.float32) * np.float32(1.0 / calibration.depth_scale)
-    depth_m[(raw == NO_DEPTH) | (depth_m > calibration.max_depth_m)] = 0.0
+    depth_m = np.multiply(raw, np.float32(1.0 / calibration.depth_scale), dtype=np.float32)
+    depth_m[raw > min(calibration.max_depth_m * calibration.depth_scale, NO_DEPTH - 1)] = 0.0
     return depth_m
 
 
