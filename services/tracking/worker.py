@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
 from services.tracking.config import TrackingConfig
@@ -19,6 +20,7 @@ from shared.tracks import (
     TrackResult,
 )
 
+_FETCHES = 4  # contexts asked for at the same time
 ContextKey = tuple[str, int, int, int]  # session, epoch, revision, reference_seq
 
 
@@ -59,9 +61,19 @@ class BusSource:
         self._request = request
         self._cache = cache
         self._config = config
+        self._ahead: dict[int, Future[LocalMap]] = {}
+
+    def fetch_ahead(self, reference_seq: int, executor: Executor) -> None:
+        """Ask for a neighbourhood now; it comes while the frame is decoded."""
+        self._ahead[reference_seq] = executor.submit(self._local_map, reference_seq)
 
     def local_map(self, reference_seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, from the cache where it is there."""
+        if reference_seq in self._ahead:
+            return self._ahead[reference_seq].result()
+        return self._local_map(reference_seq)
+
+    def _local_map(self, reference_seq: int) -> LocalMap:
         request = self._request
         asked = (request.session, request.epoch, request.map_revision, reference_seq)
         local = self._cache.get(asked)
@@ -90,6 +102,7 @@ class Worker:
         self._bus = bus
         self._config = config
         self._cache = ContextCache(config.context_cache)
+        self._fetching = ThreadPoolExecutor(_FETCHES, thread_name_prefix="context")
 
     def answer(self, request: TrackRequest) -> TrackResult:
         """Track one frame.
@@ -99,6 +112,6 @@ class Worker:
             UnavailableError: the map's owner does not answer.
         """
         request.calibration.check()
-        return track(
-            request, BusSource(self._bus, request, self._cache, self._config), self._config
-        )
+        source = BusSource(self._bus, request, self._cache, self._config)
+        source.fetch_ahead(request.prior.reference_seq if request.prior else -1, self._fetching)
+        return track(request, source, self._config)
