@@ -240,12 +240,13 @@ def test_a_new_session_holds_nothing_of_a_removal_that_broke_off(
 def test_a_session_that_nobody_asks_for_goes_to_disk_and_comes_back(
     start_at, bus, tmp_path, calibration, entry
 ):
-    start_at("tidy", tmp_path, "owner.session_idle_s=0.5")
-    opening = opened(bus, calibration, mapper="tidy")
+    start_at("tidy", tmp_path, "owner.session_idle_s=2.0")
+    # A name of its own: the other mappers on this router have a "room", with the same keys.
+    opening = opened(bus, calibration, "tidied", "tidy")
     advance(bus, opening, entry(0))
 
     wait_until_gone(bus, opening)
-    again = opened(bus, mapper="tidy")
+    again = opened(bus, session="tidied", mapper="tidy")
 
     assert again.epoch == opening.epoch + 1
     assert again.keyframe_poses.seqs.tolist() == [0]
