@@ -24,7 +24,7 @@ from services.mapping.rasterizer.memory import fetch_add
 from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import inlined, kernel
 from services.mapping.rasterizer.threads import Workers
-from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row
+from services.mapping.rasterizer.tile_boxes import tile_box, tiles_in_line, tiles_of_row
 
 # Pairs of a Gaussian and a tile that are listed at once: 76 bytes each with their gradients.
 MOST_PAIRS = 4_000_000
@@ -109,23 +109,35 @@ def _scatter(projected, width, start_of, lists, counter):
 @inlined
 def _scatter_one(projected, gaussian, columns, target, slot):
     """Write the pairs of a Gaussian; gives the next free slot."""
-    places, lists = target
-    i, depth = gaussian
-    left, right, top, bottom = tile_box(projected.boxes, i)
-    for row in range(top, bottom + 1):
-        first, last = left, right
-        if left < right and top < bottom:
+    i, _ = gaussian
+    box = tile_box(projected.boxes, i)
+    left, right, top, bottom = box
+    if left < right and top < bottom:
+        for row in range(top, bottom + 1):
             first, last = tiles_of_row(projected.records, i, row, left, right)
-        # Only the columns whose tiles lie in the range.
-        first = max(first, lists.first_tile - row * columns)
-        last = min(last, lists.first_tile + len(places) - 1 - row * columns)
-        for tile in range(row * columns + first, row * columns + last + 1):
-            place = places[tile - lists.first_tile]
-            places[tile - lists.first_tile] = place + 1
-            lists.keys[place] = depth | np.uint64(slot)
-            lists.owners[slot] = i
-            slot += 1
+            for tile in range(row * columns + first, row * columns + last + 1):
+                slot = _write_pair(gaussian, tile, target, slot)
+        return slot
+    tile, step, count = tiles_in_line(box, columns)
+    for _ in range(count):
+        slot = _write_pair(gaussian, tile, target, slot)
+        tile += step
     return slot
+
+
+@inlined
+def _write_pair(gaussian, tile, target, slot):
+    """Write a pair, if its tile lies in the range that is listed; gives the next free slot."""
+    places, lists = target
+    k = tile - lists.first_tile
+    if k < 0 or k >= len(places):
+        return slot
+    i, depth = gaussian
+    place = places[k]
+    places[k] = place + 1
+    lists.keys[place] = depth | np.uint64(slot)
+    lists.owners[slot] = i
+    return slot + 1
 
 
 @inlined

@@ -27,7 +27,7 @@ from services.mapping.rasterizer.simd import (
     splat,
     square_root,
 )
-from services.mapping.rasterizer.tile_boxes import tile_box, tiles_of_row
+from services.mapping.rasterizer.tile_boxes import tile_box, tiles_in_line, tiles_of_row
 
 _NEAR = np.float32(NEAR_M)
 _ZERO, _ONE, _HALF, _FOUR = (np.float32(x) for x in (0.0, 1.0, 0.5, 4.0))
@@ -146,11 +146,16 @@ def _tile_of(position, last):
 @inlined
 def _count_hits(projected, i, camera, hits):
     """Count a Gaussian in each tile that it hits."""
-    left, right, top, bottom = tile_box(projected.boxes, i)
     columns = (camera.width + TILE - 1) // TILE
-    for row in range(top, bottom + 1):
-        first, last = left, right
-        if left < right and top < bottom:
+    box = tile_box(projected.boxes, i)
+    left, right, top, bottom = box
+    if left < right and top < bottom:
+        for row in range(top, bottom + 1):
             first, last = tiles_of_row(projected.records, i, row, left, right)
-        for column in range(first, last + 1):
-            hits[row * columns + column] += 1
+            for column in range(first, last + 1):
+                hits[row * columns + column] += 1
+        return
+    tile, step, count = tiles_in_line(box, columns)
+    for _ in range(count):
+        hits[tile] += 1
+        tile += step

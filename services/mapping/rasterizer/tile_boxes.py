@@ -38,6 +38,17 @@ def tile_box(boxes, i):
     )
 
 
+@inlined
+def tiles_in_line(box, columns):
+    """The first tile, the step to the next, and how many there are; for a box of one row or column.
+
+    Nearly all boxes are: one loop without geometry serves them, which a processor can foresee.
+    """
+    left, right, top, bottom = box
+    step = columns if top < bottom else 1
+    return top * columns + left, step, (right - left + 1) * (bottom - top + 1)
+
+
 @reproducible
 def tiles_of_row(records, i, row, left, right):
     """First and last of the tiles `left` to `right` of a row that the ellipse hits.
