@@ -61,6 +61,7 @@ class WindowKeyframe:
     T_world_camera: NDArray[np.float64]  # [4, 4]
     is_fixed: bool  # observed, never moved
     observations: Observations  # those of the context's landmarks only
+    edge_blur_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ class KeyframeData:
     cloud_camera: PointCloud
     thumbnail: NDArray[np.uint8]  # [15, 20], grey, for place recognition
     correction: Correction  # by the local bundle adjustment; new landmarks are in it too
+    edge_blur_px: float = 0.0  # standard deviation of the blur of its edges, 0 where unknown
 
 
 @dataclass(frozen=True)

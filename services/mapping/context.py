@@ -75,6 +75,7 @@ class StoredKeyframe:
     cloud_camera: PointCloud
     thumbnail: NDArray[np.uint8]  # [15, 20]
     cone: ViewCone
+    edge_blur_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -235,6 +236,7 @@ def _window(
             T_world_camera=keyframe.T_world_camera,
             is_fixed=keyframe.seq in fixed_seqs,
             observations=_observations_of(keyframe.observations, ids),
+            edge_blur_px=keyframe.edge_blur_px,
         )
         for keyframe in members
     )

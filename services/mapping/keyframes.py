@@ -71,6 +71,7 @@ class KeyframeStore:
             cloud_camera=data.cloud_camera,
             thumbnail=data.thumbnail,
             cone=ViewCone.of(data.cloud_camera),
+            edge_blur_px=data.edge_blur_px,
         )
         self._move_keyframes(data.correction)
         self._landmarks = _corrected(
@@ -167,6 +168,7 @@ class KeyframeStore:
             "seqs": poses.seqs,
             "t_ns": np.array([k.t_ns for k in keyframes], np.int64),
             "T_world_keyframes": poses.T_world_keyframes,
+            "edge_blurs_px": np.array([k.edge_blur_px for k in keyframes], np.float64),
             "thumbnails": _joined([k.thumbnail[None] for k in keyframes], (0, 15, 20), np.uint8),
             "num_points": np.array([len(k.cloud_camera.points) for k in keyframes], np.int64),
             "points": _joined([k.cloud_camera.points for k in keyframes], (0, 3), np.float32),
@@ -234,6 +236,7 @@ def _stored(
         cloud_camera=cloud,
         thumbnail=state["thumbnails"][index],
         cone=ViewCone.of(cloud),
+        edge_blur_px=float(state["edge_blurs_px"][index]) if "edge_blurs_px" in state else 0.0,
     )
 
 

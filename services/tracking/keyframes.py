@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from services.tracking.config import KeyframeRuleConfig, SurfaceConfig
 from services.tracking.orb import Features
-from services.tracking.point_cloud import normals_at
+from services.tracking.point_cloud import BASE_PIXELS, normals_at
+from services.tracking.sharpness import edge_blur_px
+from shared.camera import Intrinsics
 from shared.frames import Frame, Prior
 from shared.rectify import RgbdImage
 from shared.se3 import angle_rad, inverse
@@ -20,6 +22,7 @@ from shared.tracks import (
     KeyframeData,
     Observations,
     PointCloud,
+    WindowKeyframe,
     landmark_id,
 )
 
@@ -32,6 +35,35 @@ class Coverage:
     landmark_share: float  # share of its features with depth that are landmarks
     T_reference_camera: NDArray[np.float64]  # [4, 4]
     median_depth_m: float
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """Blur of an image's edges beside that of the keyframes around, in pixels."""
+
+    edge_blur_px: float
+    usual_blur_px: float
+
+    @property
+    def added_blur_px(self) -> float:
+        """What motion has added: blurs add as variances do."""
+        return float(np.sqrt(max(self.edge_blur_px**2 - self.usual_blur_px**2, 0.0)))
+
+
+def sharpness_of(image: RgbdImage, window: tuple[WindowKeyframe, ...]) -> Sharpness:
+    """A frame's sharpness; keyframes whose blur nobody knows are left out."""
+    known = [keyframe.edge_blur_px for keyframe in window if keyframe.edge_blur_px > 0.0]
+    blur_px = edge_blur_px(image.rgb)
+    return Sharpness(blur_px, float(np.median(known)) if known else blur_px)
+
+
+def is_too_blurred(
+    sharpness: Sharpness, coverage: Coverage, intrinsics: Intrinsics, config: KeyframeRuleConfig
+) -> bool:
+    """Far less sharp than the keyframes around, while these still show enough to wait."""
+    scale = np.sqrt(intrinsics.width * intrinsics.height / BASE_PIXELS)
+    is_blurred = sharpness.added_blur_px > config.max_added_blur_px * scale
+    return bool(is_blurred and coverage.overlap >= config.min_blurred_overlap)
 
 
 def becomes_keyframe(
@@ -81,6 +113,7 @@ class KeyframeParts:
     cloud_camera: PointCloud
     observations: Observations
     correction: Correction
+    edge_blur_px: float
 
 
 def keyframe_data(
@@ -96,6 +129,7 @@ def keyframe_data(
         cloud_camera=thinned(parts.cloud_camera, config.max_cloud_points),
         thumbnail=thumbnail_of(image.rgb),
         correction=parts.correction,
+        edge_blur_px=parts.edge_blur_px,
     )
 
 

@@ -15,14 +15,17 @@ from services.tracking.keyframes import (
     Coverage,
     KeyframeParts,
     becomes_keyframe,
+    is_too_blurred,
     keyframe_data,
     keyframe_observations,
     nearest_reference,
+    sharpness_of,
 )
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.orb import extract_features
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.search import Found, Job, search
+from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
 from shared.frames import TrackingStatus, TrackRequest
@@ -78,7 +81,8 @@ def _begin(job: Job) -> TrackResult:
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
     observations = keyframe_observations(seq, observed.features, none)
     correction = first_correction(seq, T, observations, observed.image.intrinsics)
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+    blur_px = edge_blur_px(observed.image.rgb)
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
     return TrackResult(
         seq=seq,
         t_ns=request.frame.t_ns,
@@ -132,14 +136,19 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
     frame, prior = job.request.frame, job.request.prior
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
-    if not becomes_keyframe(frame, prior, _coverage(observed, estimate), config.keyframe):
+    coverage = _coverage(observed, estimate)
+    if not becomes_keyframe(frame, prior, coverage, config.keyframe):
+        return None
+    sharpness = sharpness_of(observed.image, estimate.local.context.window)
+    if is_too_blurred(sharpness, coverage, observed.image.intrinsics, config.keyframe):
         return None
     ids = estimate.landmark_ids(len(observed.features.octaves))
     observations = keyframe_observations(frame.seq, observed.features, ids)
     new = NewKeyframe(frame.seq, estimate.T_world_camera, observations, estimate.registration)
     with job.clock.stage("bundle_adjustment"):
         correction = adjust_window(new, estimate.local.context, observed.image.intrinsics, config)
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+    blur_px = sharpness.edge_blur_px
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
     return keyframe_data(parts, config.surface, config.keyframe)
 
 

@@ -10,7 +10,7 @@ from services.tracking.config import SurfaceConfig
 from shared.camera import Intrinsics
 from shared.tracks import PointCloud
 
-_BASE_PIXELS = 640 * 480
+BASE_PIXELS = 640 * 480
 
 
 def surface_from_depth(
@@ -50,7 +50,7 @@ def _fit_settings(
     intrinsics: Intrinsics, config: SurfaceConfig
 ) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
     """Stride and window radius in pixels of this image, its camera, and the limits."""
-    scale = np.sqrt(intrinsics.width * intrinsics.height / _BASE_PIXELS)
+    scale = np.sqrt(intrinsics.width * intrinsics.height / BASE_PIXELS)
     stride = max(1, round(config.stride_px * scale))
     radius = max(3, round(config.window_radius_px * scale))
     camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
