@@ -16,7 +16,14 @@ from services.mapping.voxels import level_of, voxel_keys
 from shared import se3
 
 FEATURES = 32
-TRAINED = ("features", "offsets", "scalings")
+
+
+def trained_widths(config: AnchorConfig) -> dict[str, int]:
+    """Width of each column that is trained, for neural or plain Gaussians."""
+    k = config.children
+    if config.gaussians == "plain":
+        return {"colours": 3 * k, "offsets": 3 * k, "opacities": k, "sizes": 3 * k, "turns": 4 * k}
+    return {"features": FEATURES, "offsets": 3 * k, "scalings": 6}
 
 
 @dataclass(frozen=True)
@@ -46,9 +53,9 @@ class AnchorMap:
     """All anchors with their optimizer state and statistics, on one device."""
 
     def __init__(self, config: AnchorConfig, device: torch.device) -> None:
-        self._config = config
+        self.config = config
         self.device = device
-        self.rows = RowTable(_columns(config.children), device)
+        self.rows = RowTable(_columns(config), device)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -61,15 +68,30 @@ class AnchorMap:
     @property
     def num_bytes(self) -> int:
         """Size of the map itself, without optimizer state."""
-        return len(self) * 4 * (3 + FEATURES + 3 * self._config.children + 6)
+        widths = {"position": 3, "scalings": 6} | trained_widths(self.config)
+        return len(self) * 4 * sum(widths.values())
 
     def keys(self) -> NDArray[np.int64]:
         """The voxels that are taken, [N]."""
         return self.rows["key"].cpu().numpy()
 
+    def heirs_features(self, index: Tensor) -> Tensor:
+        """What anchors that grow from rows `index` start with, [N, 32]; plain ones have colours."""
+        if self.config.gaussians == "neural":
+            return self.rows["features"][index]
+        colours = self.rows["colours"][index]
+        return torch.nn.functional.pad(colours, (0, FEATURES - colours.shape[1]))
+
+    def log_sizes(self, index: Tensor) -> Tensor:
+        """Log of twice the children's usual sigma, metres, [N, 3]."""
+        sizes = self.rows["scalings"][index, 3:]
+        if self.config.gaussians == "neural":
+            return sizes
+        return sizes + self.rows["sizes"][index].view(len(index), -1, 3).mean(1)
+
     def append(self, new: NewAnchors, creator_seq: int) -> int:
         """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many."""
-        new = new.first(self._config.max_anchors - len(self))
+        new = new.first(max(0, self.config.max_anchors - len(self)))
         if len(new) == 0:
             return 0
         is_primary = torch.from_numpy(new.is_primary)
@@ -77,11 +99,12 @@ class AnchorMap:
             {
                 "position": torch.from_numpy(new.positions),
                 "features": torch.from_numpy(new.features),
+                "colours": torch.from_numpy(new.features[:, : 3 * self.config.children]),
                 "offsets": torch.from_numpy(new.offsets),
                 "scalings": torch.from_numpy(new.scalings),
                 "key": torch.from_numpy(new.keys),
                 "is_primary": is_primary,
-                "rate": torch.where(is_primary, self._config.primary_rate, 1.0),
+                "rate": torch.where(is_primary, self.config.primary_rate, 1.0),
                 "creator": torch.full((len(new),), creator_seq, dtype=torch.int64),
             }
         )
@@ -98,7 +121,7 @@ class AnchorMap:
         positions = self.rows["position"][index].cpu().numpy()
         moved = se3.transform(T_new_old, positions.astype(np.float64))
         levels = level_of(self.rows["key"][index].cpu().numpy())
-        keys = voxel_keys(moved, levels, self._config)
+        keys = voxel_keys(moved, levels, self.config)
         self.rows["position"][index] = torch.from_numpy(moved).to(self.rows["position"])
         self.rows["key"][index] = torch.from_numpy(keys).to(self.device)
         sizes = self.rows["scalings"][index, None, :3].exp()
@@ -114,14 +137,15 @@ class AnchorMap:
         self.rows.restore(state)
 
 
-def _columns(children: int) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
-    widths = {"features": FEATURES, "offsets": 3 * children, "scalings": 6}
+def _columns(config: AnchorConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+    children = config.children
     trained = {
-        f"{name}{suffix}": ((widths[name],), torch.float32)
-        for name in TRAINED
+        f"{name}{suffix}": ((width,), torch.float32)
+        for name, width in trained_widths(config).items()
         for suffix in ("", "_mean", "_square")  # the value and Adam's moments
     }
     return {
+        "scalings": ((6,), torch.float32),
         **trained,
         "position": ((3,), torch.float32),
         "steps": ((), torch.int64),

@@ -13,10 +13,15 @@ def _check(is_fine: bool, text: str) -> None:
         raise ConfigError(text)
 
 
+def _check_choice(value: str, choices: tuple[str, ...], name: str) -> None:
+    _check(value in choices, f"{name} must be {' or '.join(choices)}, got {value}")
+
+
 @dataclass(frozen=True)
 class AnchorConfig:
     """Where anchors go and how they start (paper, "Neural-Gaussian Representation")."""
 
+    gaussians: str = "neural"  # or "plain": parameters of their own, no networks (an ablation)
     children: int = 5  # k, Gaussians per anchor
     voxel_size_m: float = 0.02  # at the reference depth; doubles and halves with the depth
     reference_depth_m: float = 2.0
@@ -31,6 +36,7 @@ class AnchorConfig:
     fill_holes: bool = True  # seed pixels without depth too, at the depth around them
 
     def __post_init__(self) -> None:
+        _check_choice(self.gaussians, ("neural", "plain"), "anchors.gaussians")
         _check(1 <= self.children <= 10, f"anchors.children must be 1 to 10, got {self.children}")
         _check(self.voxel_size_m > 0, "anchors.voxel_size_m must be positive")
         _check(self.reference_depth_m > 0, "anchors.reference_depth_m must be positive")
@@ -57,6 +63,10 @@ class LearningRates:
     features: float = 1e-2
     offsets: float = 0.02
     scalings: float = 7e-3
+    colours: float = 0.05  # of plain Gaussians, as the next three
+    opacities: float = 0.05
+    sizes: float = 0.02
+    turns: float = 0.01
     opacity_network: float = 2e-3
     colour_network: float = 8e-3
     covariance_network: float = 4e-3

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from services.mapping.anchors import FEATURES, TRAINED, AnchorMap
+from services.mapping.anchors import FEATURES, AnchorMap, trained_widths
 from services.mapping.config import AnchorConfig, DecoderConfig, LearningRates
 from services.mapping.rasterizer import Gaussians
 
@@ -49,8 +49,11 @@ class VisibleAnchors:
     def gather(anchors: AnchorMap, index: Tensor, is_trained: bool) -> VisibleAnchors:
         """Copy rows `index`; the trained columns become leaves of the gradient."""
         rows = anchors.rows
-        trained = [rows[name][index].requires_grad_(is_trained) for name in TRAINED]
-        return VisibleAnchors(index, rows["position"][index], *trained)
+        trained = {
+            name: rows[name][index].requires_grad_(is_trained)
+            for name in trained_widths(anchors.config)
+        }
+        return VisibleAnchors(index, rows["position"][index], **trained)
 
 
 def initial_weights(anchors: AnchorConfig, decoder: DecoderConfig, seed: int) -> Weights:

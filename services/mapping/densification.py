@@ -84,10 +84,9 @@ def _around(
     rng: np.random.Generator,
 ) -> NewAnchors:
     """One anchor for each (parent, child); not yet sorted out by voxel."""
-    at = torch.from_numpy(parents)
-    offsets, scalings, positions, features, keys = (
-        anchors.rows[name][at.to(anchors.device)].cpu().numpy()
-        for name in ("offsets", "scalings", "position", "features", "key")
+    at = torch.from_numpy(parents).to(anchors.device)
+    offsets, scalings, positions, keys = (
+        anchors.rows[name][at].cpu().numpy() for name in ("offsets", "scalings", "position", "key")
     )
     own = offsets.reshape(len(parents), -1, 3)[np.arange(len(parents)), children]
     points = positions + own * np.exp(scalings[:, :3])
@@ -96,10 +95,10 @@ def _around(
     grown = centres(points, levels, config)
     spread = rng.normal(0.0, _CHILD_SPREAD, (len(parents), config.children, 3))
     new_offsets = ((points - grown) / sides)[:, None] + spread
-    sizes = np.minimum(scalings[:, 3:] - math.log(_SHRINK), np.log(sides))
+    sizes = np.minimum(anchors.log_sizes(at).cpu().numpy() - math.log(_SHRINK), np.log(sides))
     return NewAnchors(
         positions=grown,
-        features=features,
+        features=anchors.heirs_features(at).cpu().numpy(),
         offsets=new_offsets.reshape(len(parents), -1).astype(np.float32),
         scalings=np.concatenate([np.repeat(np.log(sides), 3, 1), sizes], 1).astype(np.float32),
         keys=voxel_keys(points, levels, config),

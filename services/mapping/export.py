@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from services.mapping.decoder import VisibleAnchors, decode
 from services.mapping.pipeline import Mapper
 from services.mapping.rasterizer import Gaussians
 from services.mapping.snapshot import snapshot_folders
@@ -52,9 +51,10 @@ def bake(mapper: Mapper) -> Gaussians:
     creators = mapper.anchors.rows["creator"]
     parts = []
     for seq in creators.unique().tolist():
-        visible = VisibleAnchors.gather(mapper.anchors, (creators == seq).nonzero()[:, 0], False)
-        centre = torch.from_numpy(mapper.views[seq].T_world_camera[:3, 3]).to(visible.positions)
-        parts.append(decode(visible, centre, mapper.weights))
+        index = (creators == seq).nonzero()[:, 0]
+        centre = torch.from_numpy(mapper.views[seq].T_world_camera[:3, 3])
+        centre = centre.to(mapper.anchors.rows["position"])
+        parts.append(mapper.decoder.decode(mapper.anchors, index, centre)[1])
     joined = [torch.cat(tensors) for tensors in zip(*(p.tensors() for p in parts), strict=True)]
     if not joined:
         return Gaussians(*(torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (3,))))

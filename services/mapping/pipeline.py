@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from services.mapping import densification
-from services.mapping.anchors import TRAINED, AnchorMap
+from services.mapping.anchors import AnchorMap, trained_widths
 from services.mapping.appearance import ExposureModel
 from services.mapping.config import MappingConfig
 from services.mapping.coverage import uncovered_pixels
-from services.mapping.decoder import initial_weights, weight_optimizer
+from services.mapping.decoders import decoder_for
 from services.mapping.losses import Appearance, Target, mapping_loss
 from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.map_state import (
@@ -28,9 +28,7 @@ from services.mapping.map_state import (
     as_arrays,
     as_tensors,
     flatten,
-    restore_moments,
     unflatten,
-    weight_moments,
 )
 from services.mapping.optimizer import adam_rows, begin_step
 from services.mapping.rasterizer import View, rasterizer_for
@@ -75,13 +73,12 @@ class MapFigures:
     @staticmethod
     def of(mapper: Mapper) -> MapFigures:
         """The figures of a mapper at this moment."""
-        weights = sum(weight.numel() * 4 for weight in mapper.weights.values())
         return MapFigures(
             anchors=len(mapper.anchors),
             primary=mapper.anchors.num_primary,
             iterations=mapper.iterations,
             psnr_db=mapper.psnr_db,
-            num_bytes=mapper.anchors.num_bytes + weights,
+            num_bytes=mapper.anchors.num_bytes + mapper.decoder.num_bytes,
         )
 
 
@@ -94,11 +91,9 @@ class Mapper:
         self.config = config
         self._device = device
         self.anchors = AnchorMap(config.anchors, device)
-        weights = initial_weights(config.anchors, config.decoder, seed)
-        self.weights = {name: w.to(device).requires_grad_() for name, w in weights.items()}
-        self._weight_optimizer = weight_optimizer(self.weights, config.rates)
+        self.decoder = decoder_for(config, seed, device)
         self.painter = Painter(
-            self.anchors, self.weights, rasterizer_for(device.type), config.decoder
+            self.anchors, self.decoder, rasterizer_for(device.type), config.decoder
         )
         self.exposures = ExposureModel(config.rates)
         self.views = TrainingViews(
@@ -163,8 +158,7 @@ class Mapper:
         """Everything that a snapshot needs to go on exactly as if nothing had happened."""
         groups = {
             "anchors": self.anchors.state(),
-            "weights": {name: w.detach().cpu().clone() for name, w in self.weights.items()},
-            "adam": weight_moments(self._weight_optimizer),
+            **self.decoder.state(),
             "exposures": as_tensors(self.exposures.state()),
             "mapper": as_tensors(
                 {
@@ -187,10 +181,7 @@ class Mapper:
         """Take up a `state()`; `frames` has at least the keyframes that it names."""
         groups = unflatten(state.tensors)
         self.anchors.restore(groups["anchors"])
-        with torch.no_grad():
-            for name, weight in self.weights.items():
-                weight.copy_(groups["weights"][name])
-        restore_moments(self._weight_optimizer, groups.get("adam", {}))
+        self.decoder.restore(groups)
         self.exposures.restore(as_arrays(groups["exposures"]))
         mapper = as_arrays(groups["mapper"])
         self._background = mapper["background"].copy()
@@ -233,14 +224,11 @@ class Mapper:
     def _update(self, drawn: Drawn, rate: float) -> None:
         """Adam over the visible anchors and the networks."""
         step = begin_step(self.anchors.rows, drawn.visible.index)
-        for name in TRAINED:
+        for name in trained_widths(self.config.anchors):
             gradient = getattr(drawn.visible, name).grad
             own = getattr(self.config.rates, name)
             adam_rows(step, name, gradient, rate * own)
-        for group in self._weight_optimizer.param_groups:
-            group["lr"] = rate * group["base_rate"]
-        self._weight_optimizer.step()
-        self._weight_optimizer.zero_grad()
+        self.decoder.step(rate)
 
     @torch.no_grad()
     def _densify(self, drawn: Drawn) -> None:

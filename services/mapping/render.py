@@ -10,8 +10,7 @@ from torch import Tensor
 
 from services.mapping.anchors import AnchorMap
 from services.mapping.config import DecoderConfig
-from services.mapping.decoder import VisibleAnchors, Weights, decode
-from services.mapping.decoder_cpu import decode_cpu
+from services.mapping.decoders import Decoder, Visible
 from services.mapping.losses import Appearance
 from services.mapping.rasterizer import Gaussians, Rasterizer, Rendered, View
 from shared.maps import RenderReply
@@ -25,7 +24,7 @@ _MIN_ALPHA = 0.5 / 255.0
 class Drawn:
     """A rendered view with all that led to it."""
 
-    visible: VisibleAnchors
+    visible: Visible
     gaussians: Gaussians
     rendered: Rendered
 
@@ -35,17 +34,15 @@ class Painter:
     """The map's parts that drawing needs."""
 
     anchors: AnchorMap
-    weights: Weights
+    decoder: Decoder
     rasterizer: Rasterizer
     config: DecoderConfig
 
-    def decode(self, view: View, is_trained: bool) -> tuple[VisibleAnchors, Gaussians]:
+    def decode(self, view: View, is_trained: bool) -> tuple[Visible, Gaussians]:
         """The Gaussians of the anchors in a view (Eq. 4 to 6)."""
         index = visible_index(self.anchors, view, self.config.max_visible_anchors)
-        visible = VisibleAnchors.gather(self.anchors, index, is_trained)
-        camera = torch.from_numpy(camera_world(view)).to(visible.positions)
-        function = decode_cpu if index.device.type == "cpu" else decode
-        return visible, function(visible, camera, self.weights)
+        camera = torch.from_numpy(camera_world(view)).to(self.anchors.rows["position"])
+        return self.decoder.decode(self.anchors, index, camera, is_trained)
 
     @torch.no_grad()
     def draw(self, view: View) -> Drawn:
