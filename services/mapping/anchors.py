@@ -52,10 +52,12 @@ class NewAnchors:
 class AnchorMap:
     """All anchors with their optimizer state and statistics, on one device."""
 
-    def __init__(self, config: AnchorConfig, device: torch.device) -> None:
+    def __init__(self, config: AnchorConfig, device: torch.device, is_gated: bool = False) -> None:
         self.config = config
         self.device = device
-        self.rows = RowTable(_columns(config), device)
+        self.is_gated = is_gated  # opacities have a factor, the column `gate`
+        gate = {"gate": ((), torch.float32)} if is_gated else {}
+        self.rows = RowTable(_columns(config) | gate, device)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -104,6 +106,7 @@ class AnchorMap:
                 "scalings": torch.from_numpy(new.scalings),
                 "key": torch.from_numpy(new.keys),
                 "is_primary": is_primary,
+                "gate": torch.ones(len(new)),
                 "rate": torch.where(is_primary, self.config.primary_rate, 1.0),
                 "creator": torch.full((len(new),), creator_seq, dtype=torch.int64),
             }
@@ -151,6 +154,7 @@ def _columns(config: AnchorConfig) -> dict[str, tuple[tuple[int, ...], torch.dty
         "steps": ((), torch.int64),
         "rate": ((), torch.float32),
         "is_primary": ((), torch.bool),
+        **({} if config.features in ("colours", "random") else {"seen": ((6,), torch.float32)}),
         "creator": ((), torch.int64),
         "key": ((), torch.int64),
         "opacity_sum": ((), torch.float32),

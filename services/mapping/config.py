@@ -22,6 +22,7 @@ class AnchorConfig:
     """Where anchors go and how they start (paper, "Neural-Gaussian Representation")."""
 
     gaussians: str = "neural"  # or "plain": parameters of their own, no networks (an ablation)
+    features: str = "colours"  # what they start with; or "environment" (Eq. 7), "both", "random"
     children: int = 5  # k, Gaussians per anchor
     voxel_size_m: float = 0.02  # at the reference depth; doubles and halves with the depth
     reference_depth_m: float = 2.0
@@ -37,6 +38,10 @@ class AnchorConfig:
 
     def __post_init__(self) -> None:
         _check_choice(self.gaussians, ("neural", "plain"), "anchors.gaussians")
+        starts = ("colours", "environment", "both", "random")
+        _check_choice(self.features, starts, "anchors.features")
+        is_neural = self.gaussians == "neural"
+        _check(is_neural or self.features == "colours", "plain Gaussians start with colours")
         _check(1 <= self.children <= 10, f"anchors.children must be 1 to 10, got {self.children}")
         _check(self.voxel_size_m > 0, "anchors.voxel_size_m must be positive")
         _check(self.reference_depth_m > 0, "anchors.reference_depth_m must be positive")
@@ -97,10 +102,13 @@ class DensificationConfig:
     grow_share: float = 0.01  # of the anchors, each time
     min_visits: int = 8  # a child is judged after so many iterations that saw it
     cull_interval: int = 200
+    rule: str = "scaffold"  # or "halving": the paper's, where a voxel with too large a gradient
+    # has an anchor already, that one fades
     cull_opacity: float = 0.005  # mean of an anchor's children
     cull_visits: int = 20
 
     def __post_init__(self) -> None:
+        _check_choice(self.rule, ("scaffold", "halving"), "densification.rule")
         _check(self.grow_interval > 0, "densification.grow_interval must be positive")
         _check(self.cull_interval > 0, "densification.cull_interval must be positive")
         _check(0 <= self.grow_share <= 1, "densification.grow_share must be 0 to 1")
@@ -111,7 +119,9 @@ class ScheduleConfig:
     """Which keyframe each iteration draws, and how many iterations a frame gives."""
 
     iterations_per_frame: int = 2
-    newest_share: float = 0.3  # of draws; the others are uniform over all keyframes
+    newest_share: float = 0.3  # of draws; the others are uniform over
+    draws: str = "all"  # keyframes, or the "overlapping" ones, that see what the newest sees
+    min_overlap: float = 0.3  # of the newest keyframe's points
     cached_views: int = 16  # with their statistics for SSIM
     cached_images_mb: int = 256  # decoded images
     min_shift_m: float = 0.002  # a keyframe corrected by more takes its anchors along
@@ -120,6 +130,8 @@ class ScheduleConfig:
     def __post_init__(self) -> None:
         _check(self.iterations_per_frame >= 0, "schedule.iterations_per_frame is negative")
         _check(0 <= self.newest_share <= 1, "schedule.newest_share must be 0 to 1")
+        _check_choice(self.draws, ("all", "overlapping"), "schedule.draws")
+        _check(0 <= self.min_overlap <= 1, "schedule.min_overlap must be 0 to 1")
         _check(self.cached_views > 0, "schedule.cached_views must be positive")
 
 

@@ -67,13 +67,37 @@ def grow(
     chosen = means.flatten().topk(count).indices
     k = visits.shape[1]
     parents, children = (chosen // k).cpu().numpy(), (chosen % k).cpu().numpy()
-    added = 0
-    if count:
-        new = _around(anchors, parents, children, placement, rng)
-        added = _append_by_creator(anchors, new, rows["creator"].cpu().numpy()[parents])
+    new = _around(anchors, parents, children, placement, rng)
+    creators = rows["creator"].cpu().numpy()[parents]
+    if anchors.is_gated:
+        is_free = _halve_occupants(anchors, new.keys, placement)
+        new, creators = new.take(np.flatnonzero(is_free)), creators[is_free]
+    added = _append_by_creator(anchors, new, creators)
     for name in ("gradient_sum", "gradient_visits"):
         anchors.rows[name].zero_()
     return added
+
+
+def _halve_occupants(
+    anchors: AnchorMap, keys: NDArray[np.int64], placement: AnchorConfig
+) -> NDArray[np.bool_]:
+    """The paper's rule: "if a secondary anchor point already exists, its opacity is halved".
+
+    Networks have no opacity to halve, so it is a gate behind them. Where nothing asks for it any
+    more, it opens again; `cull` sees to the anchors that have become faint.
+
+    Returns which of the voxels `keys` [A], that ask for an anchor, hold the centre of none.
+    """
+    rows = anchors.rows
+    positions, levels = rows["position"].cpu().numpy(), level_of(keys)
+    is_asked, is_free = np.zeros(len(anchors), bool), np.ones(len(keys), bool)
+    for level in np.unique(levels):
+        present = voxel_keys(positions, np.full(len(positions), level), placement)
+        is_asked |= np.isin(present, keys)
+        is_free &= ~np.isin(keys, present)
+    is_halved = torch.from_numpy(is_asked).to(anchors.device) & ~rows["is_primary"]
+    rows["gate"].copy_((rows["gate"] * torch.where(is_halved, 0.5, 2.0)).clamp_max(1.0))
+    return is_free
 
 
 def _around(
@@ -88,7 +112,7 @@ def _around(
     offsets, scalings, positions, keys = (
         anchors.rows[name][at].cpu().numpy() for name in ("offsets", "scalings", "position", "key")
     )
-    own = offsets.reshape(len(parents), -1, 3)[np.arange(len(parents)), children]
+    own = offsets.reshape(len(parents), config.children, 3)[np.arange(len(parents)), children]
     points = positions + own * np.exp(scalings[:, :3])
     levels = np.maximum(level_of(keys) - 1, MIN_LEVEL)
     sides = sizes_m(levels, config)[:, None]
@@ -99,7 +123,7 @@ def _around(
     return NewAnchors(
         positions=grown,
         features=anchors.heirs_features(at).cpu().numpy(),
-        offsets=new_offsets.reshape(len(parents), -1).astype(np.float32),
+        offsets=new_offsets.reshape(len(parents), 3 * config.children).astype(np.float32),
         scalings=np.concatenate([np.repeat(np.log(sides), 3, 1), sizes], 1).astype(np.float32),
         keys=voxel_keys(points, levels, config),
         is_primary=np.zeros(len(parents), bool),

@@ -54,7 +54,7 @@ def bake(mapper: Mapper) -> Gaussians:
         index = (creators == seq).nonzero()[:, 0]
         centre = torch.from_numpy(mapper.views[seq].T_world_camera[:3, 3])
         centre = centre.to(mapper.anchors.rows["position"])
-        parts.append(mapper.decoder.decode(mapper.anchors, index, centre)[1])
+        parts.append(mapper.painter.gaussians(index, centre)[1])
     joined = [torch.cat(tensors) for tensors in zip(*(p.tensors() for p in parts), strict=True)]
     if not joined:
         return Gaussians(*(torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (3,))))

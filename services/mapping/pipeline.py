@@ -21,6 +21,7 @@ from services.mapping.appearance import ExposureModel
 from services.mapping.config import MappingConfig
 from services.mapping.coverage import uncovered_pixels
 from services.mapping.decoders import decoder_for
+from services.mapping.environment import Environment
 from services.mapping.losses import Appearance, Target, mapping_loss
 from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.map_state import (
@@ -90,8 +91,11 @@ class Mapper:
     ) -> None:
         self.config = config
         self._device = device
-        self.anchors = AnchorMap(config.anchors, device)
+        self.anchors = AnchorMap(
+            config.anchors, device, is_gated=config.densification.rule == "halving"
+        )
         self.decoder = decoder_for(config, seed, device)
+        self._environment = Environment(config, seed, device)
         self.painter = Painter(
             self.anchors, self.decoder, rasterizer_for(device.type), config.decoder
         )
@@ -134,7 +138,9 @@ class Mapper:
             request = SeedRequest(image, pose, is_uncovered, keyframe.landmarks_world)
             new = seed_anchors(request, self.anchors.keys(), config, self._rng)
             self.revision = keyframe.poses.revision
-            return self.anchors.append(new, keyframe.frame.seq)
+            added = self.anchors.append(new, keyframe.frame.seq)
+            self._environment.initialise(self.anchors, added, pose[:3, 3])
+            return added
 
     def iterate(self, count: int = 1) -> None:
         """Optimise on so many draws of keyframes (paper Eq. 8); nothing without keyframes."""
@@ -159,6 +165,7 @@ class Mapper:
         groups = {
             "anchors": self.anchors.state(),
             **self.decoder.state(),
+            **self._environment.state(),
             "exposures": as_tensors(self.exposures.state()),
             "mapper": as_tensors(
                 {
@@ -182,6 +189,7 @@ class Mapper:
         groups = unflatten(state.tensors)
         self.anchors.restore(groups["anchors"])
         self.decoder.restore(groups)
+        self._environment.restore(groups)
         self.exposures.restore(as_arrays(groups["exposures"]))
         mapper = as_arrays(groups["mapper"])
         self._background = mapper["background"].copy()
@@ -223,6 +231,7 @@ class Mapper:
     @torch.no_grad()
     def _update(self, drawn: Drawn, rate: float) -> None:
         """Adam over the visible anchors and the networks."""
+        self._environment.step(self.anchors, drawn.visible, rate)
         step = begin_step(self.anchors.rows, drawn.visible.index)
         for name in trained_widths(self.config.anchors):
             gradient = getattr(drawn.visible, name).grad

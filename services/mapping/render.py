@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -42,7 +42,17 @@ class Painter:
         """The Gaussians of the anchors in a view (Eq. 4 to 6)."""
         index = visible_index(self.anchors, view, self.config.max_visible_anchors)
         camera = torch.from_numpy(camera_world(view)).to(self.anchors.rows["position"])
-        return self.decoder.decode(self.anchors, index, camera, is_trained)
+        return self.gaussians(index, camera, is_trained)
+
+    def gaussians(
+        self, index: Tensor, camera: Tensor, is_trained: bool = False
+    ) -> tuple[Visible, Gaussians]:
+        """`Decoder.decode`, with opacities that anchors lost by halving."""
+        visible, gaussians = self.decoder.decode(self.anchors, index, camera, is_trained)
+        if not self.anchors.is_gated:
+            return visible, gaussians
+        gates = self.anchors.rows["gate"][index].repeat_interleave(self.anchors.config.children)
+        return visible, replace(gaussians, opacities=gaussians.opacities * gates)
 
     @torch.no_grad()
     def draw(self, view: View) -> Drawn:

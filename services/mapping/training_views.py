@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.mapping.config import ScheduleConfig
 from services.mapping.losses import Target
+from services.mapping.overlap import overlapping
 from shared.camera import Calibration
 from shared.frames import Frame
 from shared.rectify import RgbdImage, rectify
@@ -57,6 +58,7 @@ class TrainingViews:
         self._config = config
         self._make_target = make_target
         self._views: dict[int, TrainingView] = {}
+        self._overlapping: list[int] = []  # seqs that overlap the newest one's view
         self._order: list[int] = []  # seqs left in this round of a refinement
         self._rng = np.random.default_rng([seed, 1])
         pixels = calibration.colour.intrinsics.width * calibration.colour.intrinsics.height
@@ -85,6 +87,10 @@ class TrainingViews:
         """
         image = self._images.get(view.seq, lambda: rectify(view.frame, self._calibration))
         self._views[view.seq] = view
+        if self._config.draws == "overlapping":
+            poses = [(seq, other.T_world_camera) for seq, other in self._views.items()]
+            pose, share = view.T_world_camera, self._config.min_overlap
+            self._overlapping = overlapping(image, pose, poses, share)
         return image
 
     def set_pose(self, seq: int, T_world_camera: NDArray[np.float64]) -> None:
@@ -92,10 +98,15 @@ class TrainingViews:
         self._views[seq] = replace(self._views[seq], T_world_camera=T_world_camera)
 
     def draw(self) -> TrainingView:
-        """The newest keyframe in a share of draws, else any one (GS-ICP SLAM, Tab. 8)."""
+        """The newest keyframe in a share of draws, else any one (GS-ICP SLAM, Tab. 8).
+
+        By the setting `draws`, only those that overlap the newest one, as the paper's are.
+        """
         seqs = self.seqs()
         if self._rng.random() < self._config.newest_share:
             return self._views[seqs[-1]]
+        if self._config.draws == "overlapping":
+            seqs = self._overlapping or seqs[-1:]
         return self._views[seqs[int(self._rng.integers(len(seqs)))]]
 
     def draw_in_rounds(self) -> TrainingView:
@@ -119,6 +130,7 @@ class TrainingViews:
             "seqs": self.seqs(),
             "poses": [view.T_world_camera.tolist() for view in self._views.values()],
             "order": list(self._order),
+            "overlapping": list(self._overlapping),
             "generator": self._rng.bit_generator.state,
         }
 
@@ -129,4 +141,5 @@ class TrainingViews:
             for seq, pose in zip(state["seqs"], state["poses"], strict=True)
         }
         self._order = list(state["order"])
+        self._overlapping = list(state["overlapping"])
         self._rng.bit_generator.state = state["generator"]

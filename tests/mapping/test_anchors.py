@@ -133,6 +133,17 @@ def test_the_cap_keeps_primary_anchors_first():
     assert (added, anchors.num_primary) == (10, 5)
 
 
+def test_a_map_above_its_cap_takes_no_more():
+    anchors = AnchorMap(CONFIG, torch.device("cpu"))
+    anchors.append(new_anchors(20), creator_seq=0)
+    resumed = AnchorMap(AnchorConfig(max_anchors=10), torch.device("cpu"))
+    resumed.restore(anchors.state())
+
+    added = resumed.append(new_anchors(5), creator_seq=8)
+
+    assert (added, len(resumed)) == (0, 20)
+
+
 def test_a_corrected_keyframe_takes_only_its_own_anchors_along():
     anchors = AnchorMap(CONFIG, torch.device("cpu"))
     anchors.append(new_anchors(4), creator_seq=0)

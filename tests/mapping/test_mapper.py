@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from services.mapping import densification
-from services.mapping.config import DensificationConfig, MappingConfig, ScheduleConfig
+from services.mapping.config import AnchorConfig, DensificationConfig, MappingConfig, ScheduleConfig
 from services.mapping.export import bake
 from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
@@ -53,6 +53,17 @@ def test_a_view_between_keyframes_is_rendered_well_after_a_few_iterations(mapper
     for seq in (0, 4, 8):
         insert(mapper, seq)
         mapper.iterate(30)
+
+    assert psnr_db(mapper, 6) > 30.0
+
+
+def test_a_plain_map_renders_a_view_between_keyframes_well_too(calibration, insert, psnr_db):
+    config = MappingConfig(anchors=AnchorConfig(gaussians="plain"))
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
+
+    for seq in (0, 4, 8):
+        insert(mapper, seq)
+        mapper.iterate(20)
 
     assert psnr_db(mapper, 6) > 30.0
 
@@ -108,6 +119,20 @@ def test_the_newest_keyframe_gets_its_share_of_draws(mapper, insert):
     assert np.mean(np.array(draws) == 12) == pytest.approx(expected, abs=0.04)
 
 
+def test_with_overlapping_draws_only_keyframes_of_the_same_place_are_drawn(
+    calibration, insert, true_pose
+):
+    config = MappingConfig(schedule=ScheduleConfig(draws="overlapping"))
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
+    turned = true_pose(0) @ se3.exp([0, 0, 0, 0, np.pi, 0])
+    insert(mapper, 0)
+    insert(mapper, 4, at_0=turned, at_4=true_pose(4))
+
+    insert(mapper, 8, at_0=turned)
+
+    assert {mapper.views.draw().seq for _ in range(100)} == {4, 8}
+
+
 def test_a_refinement_sees_every_keyframe_once_a_round(mapper, insert):
     for seq in (0, 4, 8, 12):
         insert(mapper, seq)
@@ -143,6 +168,79 @@ def test_anchors_grow_where_the_screen_gradient_is_large(mapper, insert):
 
     assert added == 1
     assert (mapper.anchors.rows["position"][-1] - place).abs().max() <= side / 2 + 1e-6
+
+
+@pytest.fixture
+def halving(calibration, insert) -> Mapper:
+    """A map by the paper's rule, where child 1 of anchor 3 sits on anchor 7 and has a gradient."""
+    config = MappingConfig(densification=DensificationConfig(rule="halving", grow_share=1.0))
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
+    insert(mapper, 0)
+    rows = mapper.anchors.rows
+    unit = rows["scalings"][3, :3].exp()
+    rows["offsets"][3, 3:6] = (rows["position"][7] - rows["position"][3]) / unit
+    rows["gradient_visits"][:] = 20.0
+    rows["gradient_sum"][3, 1] = 1.0
+    return mapper
+
+
+def grow(mapper: Mapper) -> int:
+    config = mapper.config
+    rng = np.random.default_rng(0)
+    return densification.grow(mapper.anchors, config.densification, config.anchors, rng)
+
+
+def test_by_the_papers_rule_the_anchor_in_a_voxel_with_a_large_gradient_is_halved(halving):
+    added = grow(halving)
+
+    gates = halving.anchors.rows["gate"]
+    assert (added, float(gates[7])) == (0, 0.5)
+    assert float(gates.sum()) == len(gates) - 0.5
+
+
+def test_by_the_papers_rule_primary_anchors_are_never_halved(halving):
+    halving.anchors.rows["is_primary"][7] = True
+
+    grow(halving)
+
+    assert (halving.anchors.rows["gate"] == 1.0).all()
+
+
+def test_a_halved_anchor_opens_again_when_its_voxel_asks_no_more(halving):
+    grow(halving)
+
+    grow(halving)
+
+    assert (halving.anchors.rows["gate"] == 1.0).all()
+
+
+def test_a_halved_anchor_is_drawn_with_half_its_opacity(halving):
+    index, camera = torch.arange(9), torch.zeros(3)
+    before = halving.painter.gaussians(index, camera)[1].opacities.view(9, 5)
+    halving.anchors.rows["gate"][7] = 0.5
+
+    after = halving.painter.gaussians(index, camera)[1].opacities.view(9, 5)
+
+    torch.testing.assert_close(after[7], 0.5 * before[7])
+    assert torch.equal(after[:7], before[:7])
+
+
+def test_adams_moments_follow_anchors_when_others_go_and_come(mapper, insert):
+    insert(mapper, 0)
+    mapper.iterate(5)
+    rows = mapper.anchors.rows
+    is_kept = torch.arange(len(rows)) % 3 != 0
+    names = [n for n in rows.state() if n.endswith(("_mean", "_square")) or n == "steps"]
+    expected = {name: rows[name][is_kept].clone() for name in names}
+
+    rows.keep(is_kept)
+    insert(mapper, 40)
+
+    kept = int(is_kept.sum())
+    assert len(rows) > kept
+    for name in names:
+        assert torch.equal(rows[name][:kept], expected[name])
+        assert not rows[name][kept:].any()
 
 
 def test_a_keyframe_whose_image_is_damaged_is_refused_and_not_trained_on(
