@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -124,12 +125,14 @@ def run(folder: Folder, name: str, indices: list[int], config: TrackingConfig) -
     source = StoreSource(store, config)
     prior: Prior | None = None
     results: list[TrackResult] = []
-    for index in indices:
-        result = track(_request(folder, index, prior, store.revision), source, config)
-        if result.keyframe is not None:
-            store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
-        prior = next_prior(prior, result, store)
-        results.append(result)
+    with ThreadPoolExecutor(1) as helper:  # as a worker has
+        for index in indices:
+            request = _request(folder, index, prior, store.revision)
+            result = track(request, source, config, helper)
+            if result.keyframe is not None:
+                store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
+            prior = next_prior(prior, result, store)
+            results.append(result)
     truth = np.stack([folder.true_pose(index) for index in indices])
     return _row(name, results, truth, store)
 

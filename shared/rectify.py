@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.camera import Calibration, Camera, Intrinsics
-from shared.frames import Frame
+from shared.frames import ColourImage, DepthImage, Frame
 from shared.images import decode_colour, decode_depth
 
 
@@ -34,25 +34,49 @@ def rectify(frame: Frame, calibration: Calibration) -> RgbdImage:
     Raises:
         InputError: an image is damaged or has another size than the calibration says.
     """
-    rgb = decode_colour(frame.rgb, calibration.colour.intrinsics)
-    depth_m = decode_depth(frame.depth, calibration)
-    return rectify_images(rgb, depth_m, calibration)
+    rgb = rectify_colour(frame.rgb, calibration)
+    depth_m = rectify_depth(frame.depth, calibration)
+    return RgbdImage(rgb, depth_m, calibration.colour.intrinsics)
+
+
+def rectify_colour(image: ColourImage, calibration: Calibration) -> NDArray[np.uint8]:
+    """Decode a colour image and undistort it, [H, W, 3].
+
+    Raises:
+        InputError: as `rectify`.
+    """
+    camera = calibration.colour
+    return _undistort(decode_colour(image, camera.intrinsics), camera, cv2.INTER_LINEAR)
+
+
+def rectify_depth(image: DepthImage, calibration: Calibration) -> NDArray[np.float32]:
+    """Decode a depth image, undistort it and register it to colour, metres, [H, W].
+
+    Raises:
+        InputError: as `rectify`.
+    """
+    return _registered(decode_depth(image, calibration), calibration)
 
 
 def rectify_images(
     rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], calibration: Calibration
 ) -> RgbdImage:
     """`rectify` for images that are decoded already; depth is of the depth camera, metres."""
-    colour, depth = calibration.colour, calibration.depth
+    colour = calibration.colour
     rgb = _undistort(rgb, colour, cv2.INTER_LINEAR)
+    return RgbdImage(rgb, _registered(depth_m, calibration), colour.intrinsics)
+
+
+def _registered(depth_m: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
+    colour, depth = calibration.colour, calibration.depth
     if depth is None:  # registered by the device: to the distorted colour image
-        depth_m = _undistort(depth_m, colour, cv2.INTER_NEAREST)
-    else:
-        depth_m = _undistort(depth_m, depth, cv2.INTER_NEAREST)
-        depth_m = register_depth(
-            depth_m, depth.intrinsics, colour.intrinsics, calibration.T_colour_depth
-        )
-    return RgbdImage(rgb, depth_m, colour.intrinsics)
+        return _undistort(depth_m, colour, cv2.INTER_NEAREST)
+    return register_depth(
+        _undistort(depth_m, depth, cv2.INTER_NEAREST),
+        depth.intrinsics,
+        colour.intrinsics,
+        calibration.T_colour_depth,
+    )
 
 
 def register_depth(

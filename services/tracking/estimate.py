@@ -11,25 +11,15 @@ from services.tracking.config import TrackingConfig
 from services.tracking.least_squares import Refinement, pose_observations, refine_pose
 from services.tracking.local_map import LocalMap
 from services.tracking.matching import Matches, match_by_projection
-from services.tracking.orb import Features
+from services.tracking.observed import Observed
 from services.tracking.registration import Registration, align, linearise
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Agreement, depth_agreement
-from shared.rectify import RgbdImage
 from shared.se3 import angle_rad, inverse
-from shared.tracks import NO_LANDMARK, PointCloud
+from shared.tracks import NO_LANDMARK
 
 _SAME_M = 5e-4
 _SAME_RAD = 5e-4
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What one frame shows."""
-
-    image: RgbdImage
-    cloud: PointCloud  # camera frame
-    features: Features
 
 
 @dataclass(frozen=True)
@@ -77,6 +67,8 @@ def attempt(
     """Register from a starting pose, match features there, refine on both."""
     with clock.stage("coarse"):
         registration = align(observed.cloud, local.voxels, T_start, config.registration)
+    with clock.stage("wait"):
+        observed.wait()
     with clock.stage("refine"):
         still = _refine_until_still(observed, local, registration, config)
         agreement = depth_agreement(
@@ -127,7 +119,7 @@ def _refine(
 ) -> _Refined:
     """Match around a registered pose and minimise both errors together."""
     landmarks = local.context.landmarks
-    T, intrinsics = registration.T_world_camera, observed.image.intrinsics
+    T, intrinsics = registration.T_world_camera, observed.intrinsics
     matches = match_by_projection(observed.features, landmarks, T, intrinsics, config.orb)
     observations = pose_observations(observed.features, landmarks, matches, config.refinement)
     refinement = refine_pose(observations, registration, T, intrinsics, config.refinement)

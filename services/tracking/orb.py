@@ -15,6 +15,15 @@ from shared.rectify import RgbdImage
 
 
 @dataclass(frozen=True)
+class Keypoints:
+    """ORB features of a colour image, best first."""
+
+    keypoints_px: NDArray[np.float32]  # [M, 2]
+    octaves: NDArray[np.uint8]  # [M]
+    descriptors: NDArray[np.uint8]  # [M, 32]
+
+
+@dataclass(frozen=True)
 class Features:
     """ORB features of one image, best first."""
 
@@ -39,12 +48,17 @@ def backproject(
 
 
 def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
+    """Features of an image, with depth where it can be trusted."""
+    return with_depth(detect(image.rgb, config), image.depth_m, config)
+
+
+def detect(rgb: NDArray[np.uint8], config: OrbConfig) -> Keypoints:
     """Detect, spread over cells, describe.
 
     OpenCV keeps the strongest corners wherever they crowd; the pose wants them all over the image,
     so more are detected and each cell gives its best ones in turn.
     """
-    grey = cv2.cvtColor(image.rgb, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     orb = cv2.ORB.create(
         nfeatures=config.num_detected,
         nlevels=config.num_levels,
@@ -52,26 +66,28 @@ def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
     )
     keypoints, descriptors = orb.detectAndCompute(grey, None)
     if not keypoints:
-        return _no_features()
+        return _no_keypoints()
     pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     octaves = np.array([k.octave for k in keypoints], np.uint8)
     responses = np.array([k.response for k in keypoints], np.float32)
     chosen = spread(pixels, responses, config.cell_px, config.num_features)
-    depths = _trusted_depths(
-        image.depth_m, pixels[chosen], config.max_depth_spread, config.max_feature_depth_m
-    )
     assert descriptors is not None
-    return Features(
-        pixels[chosen], octaves[chosen], np.ascontiguousarray(descriptors[chosen], np.uint8), depths
+    return Keypoints(
+        pixels[chosen], octaves[chosen], np.ascontiguousarray(descriptors[chosen], np.uint8)
     )
 
 
-def _no_features() -> Features:
-    return Features(
-        np.zeros((0, 2), np.float32),
-        np.zeros(0, np.uint8),
-        np.zeros((0, 32), np.uint8),
-        np.zeros(0, np.float32),
+def with_depth(keypoints: Keypoints, depth_m: NDArray[np.float32], config: OrbConfig) -> Features:
+    """Look up each keypoint in the registered depth image."""
+    depths = _trusted_depths(
+        depth_m, keypoints.keypoints_px, config.max_depth_spread, config.max_feature_depth_m
+    )
+    return Features(keypoints.keypoints_px, keypoints.octaves, keypoints.descriptors, depths)
+
+
+def _no_keypoints() -> Keypoints:
+    return Keypoints(
+        np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), np.zeros((0, 32), np.uint8)
     )
 
 

@@ -6,11 +6,14 @@ whichever worker gets the frame gives the same result to the bit.
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
+
 import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.estimate import Estimate, Observed
+from services.tracking.estimate import Estimate
+from services.tracking.helpers import NoHelper
 from services.tracking.keyframes import (
     Coverage,
     KeyframeParts,
@@ -22,31 +25,37 @@ from services.tracking.keyframes import (
     sharpness_of,
 )
 from services.tracking.local_map import LocalMap, MapSource
-from services.tracking.orb import extract_features
-from services.tracking.point_cloud import surface_from_depth
+from services.tracking.observed import Observed, observe
 from services.tracking.search import Found, Job, search
 from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
 from shared.frames import TrackingStatus, TrackRequest
-from shared.rectify import rectify
 from shared.se3 import inverse
 from shared.tracks import NO_LANDMARK, KeyframeData, TrackResult
 
+_ALONE = NoHelper()
 
-def track(request: TrackRequest, source: MapSource, config: TrackingConfig) -> TrackResult:
+
+def track(
+    request: TrackRequest,
+    source: MapSource,
+    config: TrackingConfig,
+    helper: Executor = _ALONE,
+) -> TrackResult:
     """Estimate the pose of one frame and, where the map needs it, make it a keyframe.
 
     Args:
         request: the frame with its calibration and everything known before it.
         source: answers of the map's owner in the request's revision.
         config: all numbers.
+        helper: a thread for what can be done beside; the result is the same without.
 
     Raises:
         InputError: an image cannot be decoded; names the field.
     """
     clock = Stopwatch()
-    observed = _observe(request, config, clock)
+    observed = observe(request, config, clock, helper)
     job = Job(request, observed, source, config, clock)
     with clock.stage("context"):
         local = source.local_map(request.prior.reference_seq if request.prior else -1)
@@ -60,16 +69,6 @@ def track(request: TrackRequest, source: MapSource, config: TrackingConfig) -> T
     return _answer(job, found, keyframe)
 
 
-def _observe(request: TrackRequest, config: TrackingConfig, clock: Stopwatch) -> Observed:
-    with clock.stage("decode"):
-        image = rectify(request.frame, request.calibration)
-    with clock.stage("points"):
-        cloud = surface_from_depth(image.depth_m, image.intrinsics, config.surface)
-    with clock.stage("orb"):
-        features = extract_features(image, config.orb)
-    return Observed(image, cloud, features)
-
-
 def _begin(job: Job) -> TrackResult:
     """The first frame of a map holds the world in place."""
     request, observed = job.request, job.observed
@@ -80,7 +79,7 @@ def _begin(job: Job) -> TrackResult:
     seq = request.frame.seq
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
     observations = keyframe_observations(seq, observed.features, none)
-    correction = first_correction(seq, T, observations, observed.image.intrinsics)
+    correction = first_correction(seq, T, observations, observed.intrinsics)
     blur_px = edge_blur_px(observed.image.rgb)
     parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
     return TrackResult(
@@ -146,7 +145,7 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
     observations = keyframe_observations(frame.seq, observed.features, ids)
     new = NewKeyframe(frame.seq, estimate.T_world_camera, observations, estimate.registration)
     with job.clock.stage("bundle_adjustment"):
-        correction = adjust_window(new, estimate.local.context, observed.image.intrinsics, config)
+        correction = adjust_window(new, estimate.local.context, observed.intrinsics, config)
     blur_px = sharpness.edge_blur_px
     parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
     return keyframe_data(parts, config.surface, config.keyframe)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig, VerificationConfig
-from services.tracking.estimate import Estimate, Observed, attempt
+from services.tracking.estimate import Estimate, attempt
 from services.tracking.keyframes import thumbnail_of
 from services.tracking.local_map import LocalMap, MapSource
+from services.tracking.observed import Observed
 from services.tracking.prediction import predict
 from services.tracking.relocalization import locate
 from services.tracking.stopwatch import Stopwatch
@@ -39,7 +40,7 @@ class Job:
             return locate(
                 self.observed.features,
                 local.context.landmarks,
-                self.observed.image.intrinsics,
+                self.observed.intrinsics,
                 self.config.orb,
                 self.config.relocalization,
             )

@@ -1,4 +1,8 @@
-"""Times of one frame's stages; a stage entered twice counts twice."""
+"""Times of one frame's stages; a stage entered twice counts twice.
+
+Stages that run side by side on two threads have names of their own: their times add up to more
+than the total.
+"""
 
 from __future__ import annotations
 

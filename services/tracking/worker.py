@@ -103,6 +103,7 @@ class Worker:
         self._config = config
         self._cache = ContextCache(config.context_cache)
         self._fetching = ThreadPoolExecutor(_FETCHES, thread_name_prefix="context")
+        self._helpers = ThreadPoolExecutor(config.concurrent_frames, thread_name_prefix="helper")
 
     def answer(self, request: TrackRequest) -> TrackResult:
         """Track one frame.
@@ -114,4 +115,4 @@ class Worker:
         request.calibration.check()
         source = BusSource(self._bus, request, self._cache, self._config)
         source.fetch_ahead(request.prior.reference_seq if request.prior else -1, self._fetching)
-        return track(request, source, self._config)
+        return track(request, source, self._config, self._helpers)

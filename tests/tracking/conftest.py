@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.mapping.keyframes import KeyframeStore
 from services.tracking.config import TrackingConfig
+from services.tracking.helpers import NoHelper
 from services.tracking.local_map import LocalMap, derive
 from services.tracking.pipeline import track
 from shared.camera import Calibration, Camera, Intrinsics
@@ -106,9 +108,10 @@ class Session:
             T_world_first=np.eye(4),
         )
 
-    def answer(self, frame: Frame) -> TrackResult:
+    def answer(self, frame: Frame, helper: Executor | None = None) -> TrackResult:
         """The result for a frame, without taking note of it."""
-        return track(self.request(frame), StoreSource(self.store, self.config), self.config)
+        source = StoreSource(self.store, self.config)
+        return track(self.request(frame), source, self.config, helper or NoHelper())
 
     def track(self, frame: Frame) -> TrackResult:
         result = self.answer(frame)

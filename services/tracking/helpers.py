@@ -1,0 +1,20 @@
+"""Threads beside the one that tracks a frame; or none, for whoever wants one thing at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from typing import Any
+
+
+class NoHelper(Executor):
+    """An executor without threads: what is submitted runs at once, in the caller's."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run now; an exception waits in the future, as it would from a thread."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # handed on by result()
+            future.set_exception(error)
+        return future

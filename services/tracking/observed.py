@@ -1,0 +1,94 @@
+"""What one frame shows: its surface on the caller's thread, its features on a helper's meanwhile.
+
+Decoding colour and finding features needs no depth, registering needs nothing else, so the two run
+side by side and meet where features are first asked for. Where there is no helper they run one
+after the other, with the same result to the bit.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import TrackingConfig
+from services.tracking.orb import Features, Keypoints, detect, with_depth
+from services.tracking.point_cloud import surface_from_depth
+from services.tracking.stopwatch import Stopwatch
+from shared.camera import Intrinsics
+from shared.frames import TrackRequest
+from shared.rectify import RgbdImage, rectify_colour, rectify_depth
+from shared.tracks import PointCloud
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What the colour image shows."""
+
+    rgb: NDArray[np.uint8]  # [H, W, 3]
+    keypoints: Keypoints
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What one frame shows."""
+
+    depth_m: NDArray[np.float32]  # [H, W], registered, 0 where there is none
+    intrinsics: Intrinsics  # of both images
+    cloud: PointCloud  # camera frame
+    appearance: Future[Appearance]
+    config: TrackingConfig
+
+    @cached_property
+    def image(self) -> RgbdImage:
+        """Colour and depth.
+
+        Raises:
+            InputError: the colour image cannot be decoded.
+        """
+        return RgbdImage(self.appearance.result().rgb, self.depth_m, self.intrinsics)
+
+    @cached_property
+    def features(self) -> Features:
+        """Features, with depth where it can be trusted; waits until they are found.
+
+        Raises:
+            InputError: the colour image cannot be decoded.
+        """
+        return with_depth(self.appearance.result().keypoints, self.depth_m, self.config.orb)
+
+    def wait(self) -> None:
+        """Until the features are found.
+
+        Raises:
+            InputError: the colour image cannot be decoded.
+        """
+        self.appearance.result()
+
+
+def observe(
+    request: TrackRequest, config: TrackingConfig, clock: Stopwatch, helper: Executor
+) -> Observed:
+    """Decode a frame and find its surface, while the helper finds its features.
+
+    Raises:
+        InputError: the depth image cannot be decoded.
+    """
+    frame, calibration = request.frame, request.calibration
+
+    def look() -> Appearance:
+        with clock.stage("decode_colour"):
+            rgb = rectify_colour(frame.rgb, calibration)
+        with clock.stage("orb"):
+            return Appearance(rgb, detect(rgb, config.orb))
+
+    appearance = helper.submit(look)
+    with clock.stage("decode_depth"):
+        depth_m = rectify_depth(frame.depth, calibration)
+    intrinsics = calibration.colour.intrinsics
+    with clock.stage("points"):
+        cloud = surface_from_depth(depth_m, intrinsics, config.surface)
+    return Observed(depth_m, intrinsics, cloud, appearance, config)
