@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
 from services.tracking.estimate import Estimate
-from services.tracking.helpers import NoHelper
+from services.tracking.executors import NoHelper
 from services.tracking.keyframes import (
     Coverage,
     KeyframeParts,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.mapping.keyframes import KeyframeStore
 from services.tracking.config import TrackingConfig
-from services.tracking.helpers import NoHelper
+from services.tracking.executors import NoHelper
 from services.tracking.local_map import LocalMap, derive
 from services.tracking.pipeline import track
 from shared.camera import Calibration, Camera, Intrinsics
