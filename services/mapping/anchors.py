@@ -113,6 +113,10 @@ class AnchorMap:
         )
         return len(new)
 
+    def keep(self, is_kept: Tensor) -> None:
+        """Remove the anchors where `is_kept` [N] is false."""
+        self.rows.keep(is_kept)
+
     def move(self, creator_seq: int, T_new_old: NDArray[np.float64]) -> None:
         """Take the anchors of a keyframe along with its correction.
 

@@ -33,6 +33,7 @@ class AnchorConfig:
     min_alpha: float = 0.5  # a pixel below this is not covered by the map
     min_depth_gap_m: float = 0.03  # measured depth this much in front, and by this share,
     min_depth_gap: float = 0.06  # is not covered
+    carve_window_px: int = 5  # odd; all readings in it must be behind an anchor to carve it
     min_samples: int = 2  # depth samples in a voxel that make an anchor
     fill_holes: bool = True  # seed pixels without depth too, at the depth around them
 
@@ -46,6 +47,7 @@ class AnchorConfig:
         _check(self.voxel_size_m > 0, "anchors.voxel_size_m must be positive")
         _check(self.reference_depth_m > 0, "anchors.reference_depth_m must be positive")
         _check(self.max_anchors > 0, "anchors.max_anchors must be positive")
+        _check(self.carve_window_px % 2 == 1, "anchors.carve_window_px must be odd")
         _check(0 < self.initial_opacity < 1, "anchors.initial_opacity must be between 0 and 1")
 
 

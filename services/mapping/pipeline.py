@@ -18,6 +18,7 @@ from torch import Tensor
 from services.mapping import densification
 from services.mapping.anchors import AnchorMap, trained_widths
 from services.mapping.appearance import ExposureModel
+from services.mapping.carving import carve
 from services.mapping.config import MappingConfig
 from services.mapping.coverage import uncovered_pixels
 from services.mapping.decoders import decoder_for
@@ -134,6 +135,7 @@ class Mapper:
             self._follow_corrections(keyframe.poses)
             image = self._add_view(keyframe)
             pose, config = keyframe.T_world_camera, self.config.anchors
+            carve(self.anchors, image, pose, config)
             is_uncovered = uncovered_pixels(self.painter, image, pose, config)
             request = SeedRequest(image, pose, is_uncovered, keyframe.landmarks_world)
             new = seed_anchors(request, self.anchors.keys(), config, self._rng)
