@@ -105,6 +105,7 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, default=Path("pointslam-data"), metavar="DIR")
     parser.add_argument("--http-port", type=int, default=8080, metavar="P")
     parser.add_argument("--grpc-port", type=int, default=50051, metavar="P")
+    parser.add_argument("--mappers", type=int, default=1, metavar="N", help="share the sessions")
     _add_settings(parser)
     parser.set_defaults(command=_up)
 
@@ -117,6 +118,7 @@ def _up(arguments: argparse.Namespace) -> None:
         data=arguments.data,
         logs=arguments.data / "logs",
         num_trackers=arguments.trackers,
+        num_mappers=arguments.mappers,
         device=arguments.device,
         http_port=arguments.http_port,
         grpc_port=arguments.grpc_port,

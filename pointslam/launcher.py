@@ -27,18 +27,20 @@ class LaunchOptions:
     device: str = "auto"
     http_port: int = 0
     grpc_port: int = 0
+    num_mappers: int = 1
     settings: ServiceSettings = field(default_factory=ServiceSettings)
 
     def __post_init__(self) -> None:
-        if self.num_trackers < 1:
-            raise ConfigError(f"at least 1 tracker is needed, got {self.num_trackers}")
+        for role, number in (("tracker", self.num_trackers), ("mapper", self.num_mappers)):
+            if number < 1:
+                raise ConfigError(f"at least 1 {role} is needed, got {number}")
         for name, port in (("http_port", self.http_port), ("grpc_port", self.grpc_port)):
             if not 0 <= port <= 65535:
                 raise ConfigError(f"{name} must be 0 to 65535, got {port}")
 
 
 class Services:
-    """A router, a gateway, trackers and a mapper; a context manager that stops them.
+    """A router, a gateway, trackers and mappers; a context manager that stops them.
 
     Raises:
         UnavailableError: one of them did not start; holds the end of its log.
@@ -117,11 +119,12 @@ class Services:
             return Command(name, role, f"services.{role}", (*common, *arguments, *settings))
 
         trackers = [f"tracker-{i}" for i in range(options.num_trackers)]
+        mappers = [f"mapper-{i}" for i in range(options.num_mappers)]
         http = ("--http-host", _HOST, "--http-port", str(self.http_port))
         data = ("--data", str(options.data), "--device", options.device)
         return [
             *(command("tracking", name) for name in trackers),
-            command("mapping", "mapper-0", *data),
+            *(command("mapping", name, *data) for name in mappers),
             command("gateway", "gateway-0", *http, "--grpc-port", str(self.grpc_port)),
         ]
 

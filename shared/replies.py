@@ -13,6 +13,7 @@ from shared import codec
 from shared.errors import (
     ConfigError,
     ConflictError,
+    GoneError,
     InputError,
     NotFoundError,
     PointSlamError,
@@ -61,6 +62,9 @@ def answer_query(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any
             result = answer(codec.unpack(kind, payload))
             for piece in result if isinstance(result, Iterator) else (result,):
                 query.reply(key, codec.pack(piece))
+        except GoneError as error:
+            # No reply at all is how a process that is gone answers: the sender looks for another.
+            LOGGER.warning("%s: not answered: %s", key, error)
         except InputError as error:
             query.reply_err(codec.pack(_Failure(error.code, error.reason, error.field)))
         except PointSlamError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ from shared.errors import (
     ConflictError,
     GoneError,
     NotFoundError,
+    PointSlamError,
+    StorageError,
     TimedOutError,
     UnavailableError,
 )
@@ -46,7 +48,6 @@ class MapOwner:
         self.acknowledged_revision = opened.map_revision
         self.logged_seq = opened.last.seq if opened.last else -1
         self.keyframes = opened.keyframe_poses
-        self._mode = opened.mode
         self._fabric = fabric
         self._config = fabric.config.mapping
         self._reopening = asyncio.Lock()
@@ -133,16 +134,13 @@ class MapOwner:
         return True
 
     async def _open_anywhere(self) -> bool:
-        names = sorted(self._fabric.mappers.names, key=lambda name: name != self.mapper)
-        for name in names:
-            try:
-                opened = await ask_open(self._fabric, name, OpenRequest(self.session, self._mode))
-            except (UnavailableError, NotFoundError, ConflictError) as error:
-                LOGGER.info("%s: mapper %s does not take it: %s", self.session, name, error)
-                continue
-            self._take(opened)
-            return True
-        return False
+        try:
+            opened = await open_existing(self._fabric, self.session, self.mapper)
+        except UnavailableError as error:
+            LOGGER.info("%s: %s", self.session, error)
+            return False
+        self._take(opened)
+        return True
 
     def _take(self, opened: OpenReply) -> None:
         LOGGER.warning(
@@ -160,10 +158,44 @@ class MapOwner:
             self.keyframes = poses
 
 
-async def ask_open(fabric: Fabric, mapper: str, request: OpenRequest) -> OpenReply:
-    """Open or create a session on one mapper."""
+async def open_new(fabric: Fabric, request: OpenRequest, mappers: Sequence[str]) -> OpenReply:
+    """Create a session on the first of the mappers that has room and is well.
+
+    Raises:
+        InputError, ConflictError: the request cannot be met anywhere.
+        UnavailableError: no mapper could take it; says why.
+    """
+    return await _open_on_first(fabric, request, mappers, (UnavailableError, StorageError))
+
+
+async def open_existing(fabric: Fabric, session: str, preferred: str) -> OpenReply:
+    """Open a session from disk, on the preferred mapper if that can.
+
+    Raises:
+        UnavailableError: no mapper could take it now, such as while a lost owner's lease runs.
+    """
+    mappers = sorted(fabric.mappers.names, key=lambda name: (name != preferred, name))
+    passed_over = (UnavailableError, StorageError, NotFoundError, ConflictError)
+    # The mode of a session on disk is the disk's to say.
+    return await _open_on_first(fabric, OpenRequest(session, "offline"), mappers, passed_over)
+
+
+async def _open_on_first(
+    fabric: Fabric,
+    request: OpenRequest,
+    mappers: Sequence[str],
+    passed_over: tuple[type[PointSlamError], ...],
+) -> OpenReply:
+    refusals = []
     timeout_s = fabric.config.mapping.open_timeout_s
-    return await fabric.bus.ask(Keys.mapper(mapper, "open"), request, OpenReply, timeout_s)
+    for mapper in mappers:
+        try:
+            return await fabric.bus.ask(Keys.mapper(mapper, "open"), request, OpenReply, timeout_s)
+        except passed_over as error:
+            refusals.append(f"{mapper}: {error}")
+    raise UnavailableError(
+        f"no mapper takes session {request.session} ({'; '.join(refusals) or 'none is alive'})"
+    )
 
 
 async def ask_keyframes(fabric: Fabric, key: str) -> KeyframePoses:

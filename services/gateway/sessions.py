@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 import uuid
 from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from services.gateway.decode import matrix_of
 from services.gateway.dispatch import choose
-from services.gateway.owner import Fabric, ask_open
+from services.gateway.owner import Fabric, open_existing, open_new
 from services.gateway.session import Session
 from shared import codec
 from shared.bus import Keys
@@ -26,7 +28,7 @@ from shared.errors import (
 )
 from shared.maps import DeleteRequest, Empty, MapInfo, SessionList
 from shared.se3 import Pose
-from shared.tracks import OpenRequest
+from shared.tracks import OpenReply, OpenRequest
 
 MODES = ("live", "offline")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -66,15 +68,16 @@ class Sessions:
 
     fabric: Fabric
     _open: dict[str, Session] = field(default_factory=dict)
-    _opening: asyncio.Lock = field(default_factory=asyncio.Lock)
+    # One lock a name, for as long as somebody opens it: no session waits for another's map.
+    _opening: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)
 
     async def create(self, request: CreateRequest) -> Session:
-        """A new session on the mapper that has the fewest of ours.
+        """A new session, on the mapper that has the fewest of ours and room for it.
 
         Raises:
             InputError: a field cannot be used.
             ConflictError: a session of that name exists.
-            UnavailableError: no mapper is there.
+            UnavailableError: no mapper takes it.
         """
         request.check()
         name = request.name or uuid.uuid4().hex
@@ -85,10 +88,10 @@ class Sessions:
             calibration=request.calibration,
             T_world_first=request.T_world_first(),
         )
-        async with self._opening:
+        async with self._lock_of(name):
             if name in self._open or await self._mapper_of(name) is not None:
                 raise ConflictError(f"session {name} exists")
-            opened = await ask_open(self.fabric, self._mapper_for(name), open_request)
+            opened = await open_new(self.fabric, open_request, self._mappers_for(name))
             self._open[name] = session = Session(self.fabric, opened)
         return session
 
@@ -97,16 +100,13 @@ class Sessions:
 
         Raises:
             NotFoundError: there is no such session.
+            UnavailableError: no mapper could take it up in time.
         """
         if name in self._open:
             return self._open[name]
-        async with self._opening:
+        async with self._lock_of(name):
             if name not in self._open:
-                mapper = await self._mapper_of(name)
-                if mapper is None:
-                    raise NotFoundError(f"no session {name[:64]!r}")
-                opened = await ask_open(self.fabric, mapper, OpenRequest(name, "offline"))
-                self._open[name] = Session(self.fabric, opened)
+                self._open[name] = Session(self.fabric, await self._resume(name))
         return self._open[name]
 
     async def list(self) -> list[dict[str, Any]]:
@@ -159,14 +159,34 @@ class Sessions:
             session.close()
         self._open.clear()
 
-    def _mapper_for(self, name: str) -> str:
-        loads = dict.fromkeys(self.fabric.mappers.names, 0)
+    def _lock_of(self, name: str) -> asyncio.Lock:
+        return self._opening.setdefault(name, asyncio.Lock())
+
+    async def _resume(self, name: str) -> OpenReply:
+        """The session from disk; waits while the lease of an owner that is gone runs out."""
+        mapping = self.fabric.config.mapping
+        deadline = time.monotonic() + mapping.reopen_wait_s
+        while True:
+            mapper = await self._mapper_of(name)
+            if mapper is None:
+                raise NotFoundError(f"no session {name[:64]!r}")
+            try:
+                return await open_existing(self.fabric, name, mapper)
+            except UnavailableError:
+                if time.monotonic() > deadline:
+                    raise
+            await asyncio.sleep(mapping.retry_s)
+
+    def _mappers_for(self, name: str) -> list[str]:
+        """The live mappers, the one chosen for a new session first, then by load."""
+        loads = dict.fromkeys(sorted(self.fabric.mappers.names), 0)
         if not loads:
             raise UnavailableError("no mapper is alive")
         for session in self._open.values():
             if session.owner.mapper in loads:
                 loads[session.owner.mapper] += 1
-        return choose(name, loads, self.fabric.config.dispatch.load_cap)
+        chosen = choose(name, loads, self.fabric.config.dispatch.load_cap)
+        return sorted(loads, key=lambda mapper: (mapper != chosen, loads[mapper]))
 
     async def _mapper_of(self, name: str) -> str | None:
         """The mapper that has the session open, or else one whose disk holds it."""

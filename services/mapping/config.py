@@ -147,11 +147,16 @@ class OwnerConfig:
     live_idle_s: float = 60.0  # live: optimise for so long after the last entry
     session_idle_s: float = 600.0  # a session that nobody asks for so long goes to disk
     chunk_bytes: int = 4 << 20
+    lease_s: float = 5.0  # a frozen owner's sessions are free to others after so long
+    lease_store: str = ""  # SQLite beside the sessions, or postgresql://user@host/name
+    max_sessions: int = 16  # open at a time; others go to another mapper
 
     def __post_init__(self) -> None:
         _check(self.max_pending > 0, "owner.max_pending must be positive")
         _check(self.max_pending_live > 0, "owner.max_pending_live must be positive")
         _check(self.session_idle_s > 0, "owner.session_idle_s must be positive")
+        _check(self.lease_s >= 0.5, f"owner.lease_s must be at least 0.5, got {self.lease_s}")
+        _check(self.max_sessions > 0, "owner.max_sessions must be positive")
         _check(self.chunk_bytes > 0, "owner.chunk_bytes must be positive")
 
 

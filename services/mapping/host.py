@@ -14,26 +14,25 @@ from typing import Any
 import torch
 
 from services.mapping.config import MappingConfig
+from services.mapping.leases import open_lease_store
 from services.mapping.log import count_keyframes
+from services.mapping.opening import check_same, new_record
 from services.mapping.session import Session, Surroundings
 from services.mapping.storage import (
     SessionFolder,
-    SessionRecord,
     check_session_name,
     has_session,
     read_record,
     remove_session,
     storage_errors,
 )
-from services.mapping.worker import LIVE, OFFLINE
-from shared import codec
+from services.mapping.tenure import Lease, Tenure
 from shared.bus import Bus, Keys
 from shared.errors import (
-    ConflictError,
-    InputError,
     NotFoundError,
     PointSlamError,
     StorageError,
+    UnavailableError,
 )
 from shared.maps import (
     DeleteRequest,
@@ -98,6 +97,9 @@ class MapperHost:
         self._served: dict[str, _Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
         self._is_closed = threading.Event()
+        owner = settings.config.owner
+        store = open_lease_store(owner.lease_store, settings.data)
+        self._tenure = Tenure(store, settings.name, owner.lease_s, self._lost)
         self._janitor = threading.Thread(target=self._put_away_idle, name="janitor", daemon=True)
         with storage_errors(str(settings.data)):
             settings.data.mkdir(parents=True, exist_ok=True)
@@ -120,15 +122,16 @@ class MapperHost:
         Raises:
             InputError: the name, mode or calibration cannot be used.
             NotFoundError: no such session, and no calibration to create it with.
-            ConflictError: the session exists with another calibration, or elsewhere.
-            StorageError: the disk refused, or its log is damaged.
+            ConflictError: the session exists with another calibration, or another mapper owns it.
+            UnavailableError: this mapper has its fill of sessions.
+            StorageError: the disk or the lease store refused, or the log is damaged.
         """
         check_session_name(request.session)
         with self._lock:
             if request.session not in self._served:
-                self._served[request.session] = self._serve(self._open_folder(request))
+                self._served[request.session] = self._serve(request)
             elif request.calibration is not None:
-                _check_same(self._served[request.session].session.record, request)
+                check_same(self._served[request.session].session.record, request)
             return self._served[request.session].session.opening()
 
     def list(self) -> SessionList:
@@ -143,6 +146,7 @@ class MapperHost:
 
         Raises:
             NotFoundError: there is no such session.
+            ConflictError: another mapper owns it.
         """
         check_session_name(request.session)
         path = self._settings.data / request.session
@@ -151,16 +155,19 @@ class MapperHost:
                 raise NotFoundError(f"there is no session {request.session}")
             if (served := self._served.pop(request.session, None)) is not None:
                 _withdraw(served, is_saved=False)
+            else:
+                self._tenure.claim(request.session, above=0)
             remove_session(path)
+            self._tenure.forget(request.session)
         return Empty()
 
     def close(self) -> None:
         """Withdraw every session, with a snapshot of each."""
         self._is_closed.set()
         with self._lock:
-            for served in self._served.values():
-                _withdraw(served, is_saved=True)
-            self._served.clear()
+            for name in list(self._served):
+                self._put_away(name)
+        self._tenure.close()
         self._queries.shutdown(wait=False, cancel_futures=True)
 
     def _put_away_idle(self) -> None:
@@ -171,28 +178,48 @@ class MapperHost:
                 for name, served in list(self._served.items()):
                     is_idle = time.monotonic() - served.used_s > idle_s
                     if is_idle and not served.session.is_working:
-                        _withdraw(self._served.pop(name), is_saved=True)
+                        self._put_away(name)
                         LOGGER.info("%s: idle, put away", name)
 
-    def _open_folder(self, request: OpenRequest) -> SessionFolder:
-        path = self._settings.data / request.session
-        if has_session(path):
-            if request.calibration is not None:
-                _check_same(read_record(path), request)
-            return SessionFolder(path)
-        record = _new_record(request)
-        folder = SessionFolder(path)
-        folder.clear()
-        folder.write_record(record)
-        return folder
+    def _put_away(self, name: str) -> None:
+        """Save a session and let any mapper have it; the caller holds the lock."""
+        _withdraw(self._served.pop(name), is_saved=True)
+        self._tenure.release(name)
 
-    def _serve(self, folder: SessionFolder) -> _Served:
+    def _lost(self, name: str, epoch: int) -> None:
+        """Another mapper took a session while this process was frozen or out of reach."""
+        self._queries.submit(self._step_down, name, epoch)
+
+    def _step_down(self, name: str, epoch: int) -> None:
+        with self._lock:
+            served = self._served.get(name)
+            if served is not None and served.session.record.epoch == epoch:
+                _withdraw(self._served.pop(name), is_saved=False)
+
+    def _claim(self, request: OpenRequest) -> tuple[SessionFolder, Lease]:
+        """The session's folder and lease; a new session's folder is made when it is ours."""
+        path = self._settings.data / request.session
+        exists = has_session(path)
+        record = read_record(path) if exists else new_record(request)
+        if exists and request.calibration is not None:
+            check_same(record, request)
+        lease = self._tenure.claim(request.session, record.epoch)
+        folder = SessionFolder(path)
+        if not exists:
+            folder.clear()
+            folder.write_record(record)
+        return folder, lease
+
+    def _serve(self, request: OpenRequest) -> _Served:
         settings = self._settings
+        if len(self._served) >= settings.config.owner.max_sessions:
+            raise UnavailableError(f"mapper {settings.name} has {len(self._served)} sessions open")
         surroundings = Surroundings(settings.name, settings.config, settings.device, self._publish)
         try:
-            session = Session(folder, surroundings)
+            folder, lease = self._claim(request)
+            session = Session(folder, lease, surroundings)
         except PointSlamError:
-            folder.close()
+            self._tenure.release(request.session)
             raise
         served = _Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
         record = session.record
@@ -217,7 +244,8 @@ class MapperHost:
         served = self._served.get(folder.name)
         try:
             record = read_record(folder)
-            keyframes = sum(count_keyframes(path) for path in folder.glob("log-*.bin"))
+            logs = sorted(folder.glob("log-*.bin"))
+            keyframes = sum(count_keyframes(p, record.log_ends.get(p.name)) for p in logs)
         except StorageError as error:
             LOGGER.warning("not listed: %s", error)
             return None
@@ -253,27 +281,3 @@ def _withdraw(served: _Served, is_saved: bool) -> None:
         stop()
     served.advances.shutdown(wait=True, cancel_futures=True)  # none may find the log closed
     served.session.close(is_saved)
-
-
-def _new_record(request: OpenRequest) -> SessionRecord:
-    if request.calibration is None:
-        raise NotFoundError(f"there is no session {request.session}")
-    if request.mode not in (OFFLINE, LIVE):
-        raise InputError("mode", f"must be {OFFLINE!r} or {LIVE!r}, got {request.mode[:40]!r}")
-    request.calibration.check()
-    return SessionRecord(
-        session=request.session,
-        mode=request.mode,
-        seed=request.seed,
-        epoch=0,
-        created_ns=time.time_ns(),
-        calibration=request.calibration,
-        T_world_first=request.T_world_first,
-    )
-
-
-def _check_same(record: SessionRecord, request: OpenRequest) -> None:
-    """Creating a session again is fine if it means the same: the sender lost the reply."""
-    again = (request.mode, request.seed, codec.pack(request.calibration))
-    if again != (record.mode, record.seed, codec.pack(record.calibration)):
-        raise ConflictError(f"session {request.session} exists with other settings")

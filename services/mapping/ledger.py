@@ -13,7 +13,7 @@ from services.mapping.log import SessionLog, read_log
 from services.mapping.map_state import MapState
 from services.mapping.pipeline import NewKeyframe
 from services.mapping.snapshot import read_newest
-from services.mapping.storage import SessionFolder
+from services.mapping.storage import SessionFolder, SessionRecord
 from shared.errors import ConflictError
 from shared.frames import Frame
 from shared.maps import Trajectory
@@ -48,22 +48,26 @@ class Resumed:
 class Ledger:
     """Log, records and keyframe store, always in step with each other; safe from any thread."""
 
-    def __init__(self, folder: SessionFolder, epoch: int, config: KeyframeConfig) -> None:
+    def __init__(
+        self, folder: SessionFolder, record: SessionRecord, config: KeyframeConfig
+    ) -> None:
         self._lock = threading.Lock()
         self._records: dict[int, FrameRecord] = {}
         self._last: FrameRecord | None = None
         self._store = KeyframeStore(config)
-        self.resumed = self._resume(folder, config)
-        self._log = SessionLog(folder.log_path(epoch))
+        self.resumed = self._resume(folder, record.log_ends, config)
+        self._log = SessionLog(folder.log_path(record.epoch))
 
-    def _resume(self, folder: SessionFolder, config: KeyframeConfig) -> Resumed:
-        """Read the newest snapshot and every log."""
+    def _resume(
+        self, folder: SessionFolder, log_ends: dict[str, int], config: KeyframeConfig
+    ) -> Resumed:
+        """Read the newest snapshot and every older epoch's log."""
         snapshot = read_newest(folder.path)
         resumed = Resumed(snapshot.map if snapshot else None)
         if snapshot:
             self._store = KeyframeStore.from_state(snapshot.keyframes, config)
-        for path in folder.log_paths():
-            for entry in read_log(path):
+        for name in sorted(log_ends):
+            for entry in read_log(folder.path / name, log_ends[name]):
                 if snapshot and len(self._records) < snapshot.entries:
                     self._remember(entry.record)
                     if entry.frame is not None:

@@ -68,17 +68,17 @@ def _write_all(file: IO[bytes], data: bytes) -> None:
         view = view[file.write(view) :]
 
 
-def read_log(path: Path) -> Iterator[Advance]:
-    """The entries of a log; leaves out a last one that a crash left torn.
+def read_log(path: Path, end: int | None = None) -> Iterator[Advance]:
+    """The entries of a log, up to byte `end`; leaves out a last one that a crash left torn.
 
     Raises:
         StorageError: an entry before the last one fails its checksum.
     """
     with storage_errors(str(path)), path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
+        size = _size(file, end)
         while (start := file.tell()) < size:
-            payload = _read_payload(file)
-            if payload is None and not _is_blank(file):
+            payload = _read_payload(file, size)
+            if payload is None and not _is_blank(file, size):
                 raise StorageError(f"{path}: the entry at byte {start} fails its checksum")
             if payload is None:
                 LOGGER.warning("%s: %d bytes at the end are torn", path, size - start)
@@ -86,17 +86,17 @@ def read_log(path: Path) -> Iterator[Advance]:
             yield _decoded(payload, path)
 
 
-def count_keyframes(path: Path) -> int:
+def count_keyframes(path: Path, end: int | None = None) -> int:
     """Keyframes in a log, by the ends of its entries: their images are neither read nor checked."""
     count = 0
     with storage_errors(str(path)), path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
+        size = _size(file, end)
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            end = file.tell() + _HEAD.unpack(head)[0]
-            if end > size or end == file.tell():
+            next_entry = file.tell() + _HEAD.unpack(head)[0]
+            if next_entry > size or next_entry == file.tell():
                 break
-            file.seek(max(file.tell(), end - len(_NO_KEYFRAME)))
-            count += file.read(end - file.tell()) != _NO_KEYFRAME
+            file.seek(max(file.tell(), next_entry - len(_NO_KEYFRAME)))
+            count += file.read(next_entry - file.tell()) != _NO_KEYFRAME
     return count
 
 
@@ -107,21 +107,27 @@ def _decoded(payload: bytes, path: Path) -> Advance:
         raise StorageError(f"{path}: an entry cannot be read ({error})") from None
 
 
-def _is_blank(file: IO[bytes]) -> bool:
+def _size(file: IO[bytes], end: int | None) -> int:
+    """Bytes that belong to a log: those behind `end` were written by an owner that was none."""
+    size = os.fstat(file.fileno()).st_size
+    return size if end is None else min(size, end)
+
+
+def _is_blank(file: IO[bytes], size: int) -> bool:
     """Whether nothing but zeros follows: a power cut may lengthen a file before it fills it."""
-    while block := file.read(1 << 20):
+    while block := file.read(min(1 << 20, max(0, size - file.tell()))):
         if any(block):
             return False
     return True
 
 
-def _read_payload(file: IO[bytes]) -> bytes | None:
+def _read_payload(file: IO[bytes], size: int) -> bytes | None:
     """The next payload; None where it is incomplete or fails its checksum."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
     length, checksum = _HEAD.unpack(head)
-    payload = file.read(length)
+    payload = file.read(min(length, max(0, size - file.tell())))
     if length == 0 or len(payload) < length or zlib.crc32(payload) != checksum:
         return None
     return payload

@@ -18,6 +18,7 @@ from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import MapFigures, Mapper
 from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
+from services.mapping.tenure import Lease
 from services.mapping.worker import MapWorker
 from shared.errors import ConfigError, InputError, PointSlamError
 from shared.maps import (
@@ -49,12 +50,13 @@ class Surroundings:
 class Session:
     """One session's map; its methods may be called from any thread, `advance` from one."""
 
-    def __init__(self, folder: SessionFolder, surroundings: Surroundings) -> None:
+    def __init__(self, folder: SessionFolder, lease: Lease, surroundings: Surroundings) -> None:
         self._folder = folder
+        self._lease = lease
         self._surroundings = surroundings
         config = surroundings.config
-        self.record = folder.take_up()
-        self.ledger = Ledger(folder, self.record.epoch, config.keyframes)
+        self.record = folder.take_up(lease.epoch)
+        self.ledger = Ledger(folder, self.record, config.keyframes)
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._worker = MapWorker(mapper, self.record.mode, config)
@@ -114,13 +116,16 @@ class Session:
 
         Raises:
             InputError, ConflictError, StorageError: as `Ledger.append`.
+            GoneError: another mapper may own the session by now; nothing is acknowledged.
         """
         with self._calm:
+            self._lease.check()
             if not self.ledger.holds(entry.record.seq):
                 keyframe = self.ledger.append(entry)
                 self._worker.submit(keyframe)
                 if keyframe is not None:
                     self._surroundings.publish(self.record.session, keyframe.poses)
+            self._lease.check()  # this process may have been frozen before or while it wrote
         self._worker.wait_for_room()
         return AdvanceReply(entry.record.seq, self.ledger.revision)
 
@@ -160,6 +165,7 @@ class Session:
 
         Raises:
             StorageError: the disk refused.
+            GoneError: another mapper may own the session by now.
         """
         with self._saving:
             with self._calm:
@@ -168,7 +174,7 @@ class Session:
                 revision = self.ledger.revision
                 state = self._worker.visit(lambda mapper: mapper.state())
             snapshot = Snapshot(capture.entries, state, capture.keyframes)
-            size = write_snapshot(self._folder.path, snapshot)
+            size = write_snapshot(self._folder.path, snapshot, self._lease.check)
             self._saved = capture.entries, state.values["iterations"]
         return SaveReply(revision, size)
 
@@ -208,7 +214,6 @@ class Session:
             self._save_if_near()
         self._worker.stop()
         self.ledger.close()
-        self._folder.close()
 
     def _save_now_and_then(self) -> None:
         interval_s = self._surroundings.config.owner.snapshot_interval_s

@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,8 +43,12 @@ class Snapshot:
     keyframes: Mapping[str, np.ndarray]  # of the KeyframeStore
 
 
-def write_snapshot(session: Path, snapshot: Snapshot) -> int:
+def write_snapshot(
+    session: Path, snapshot: Snapshot, check_owner: Callable[[], None] = lambda: None
+) -> int:
     """Write a snapshot and remove all but the newest two; returns its size in bytes.
+
+    `check_owner` is called before the snapshot gets its name; what it raises leaves none.
 
     Raises:
         StorageError: the disk refused; older snapshots are as they were.
@@ -60,6 +64,7 @@ def write_snapshot(session: Path, snapshot: Snapshot) -> int:
         except (OSError, safetensors.SafetensorError) as error:
             shutil.rmtree(temporary, ignore_errors=True)
             raise StorageError(f"{final}: {error}") from error
+        check_owner()
         temporary.rename(final)
         sync_folder(session)
     for folder in snapshot_folders(session)[:-_KEPT]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 
 from shared import codec
 from shared.camera import Calibration
-from shared.errors import ConflictError, InputError, NotFoundError, StorageError
+from shared.errors import InputError, NotFoundError, StorageError
 
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")
-_RECORD, _LOCK = "session.msgpack", "lock"
+_RECORD = "session.msgpack"
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,7 @@ class SessionRecord:
     created_ns: int
     calibration: Calibration
     T_world_first: NDArray[np.float64]  # [4, 4]
+    log_ends: dict[str, int] = field(default_factory=dict)  # bytes of each older epoch's log
 
 
 def check_session_name(name: str) -> None:
@@ -78,23 +78,13 @@ def sync_folder(folder: Path) -> None:
 
 
 class SessionFolder:
-    """The folder of one session; held by one process at a time."""
+    """The folder of one session; whoever writes to it holds the session's lease."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with storage_errors(str(path)):
             path.mkdir(parents=True, exist_ok=True)
             sync_folder(path.parent)
-            self._lock = (path / _LOCK).open("w")
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._lock.close()
-            raise ConflictError(f"session {path.name} is open in another process") from None
-
-    def close(self) -> None:
-        """Let another process have it."""
-        self._lock.close()
 
     def clear(self) -> None:
         """Remove what a broken removal left: it must not become part of a new session."""
@@ -102,13 +92,19 @@ class SessionFolder:
             for path in self.path.iterdir():
                 if path.is_dir():
                     shutil.rmtree(path)
-                elif path.name != _LOCK:
+                else:
                     path.unlink()
 
-    def take_up(self) -> SessionRecord:
-        """The record, with a new epoch that is on disk already."""
+    def take_up(self, epoch: int) -> SessionRecord:
+        """The record in its new epoch, on disk already, with the older logs cut at their ends.
+
+        What a frozen owner of an older epoch appends after this was never acknowledged and is
+        not part of the session.
+        """
         record = read_record(self.path)
-        record = replace(record, epoch=record.epoch + 1)
+        with storage_errors(str(self.path)):
+            found = {path.name: path.stat().st_size for path in self.log_paths()}
+        record = replace(record, epoch=epoch, log_ends=found | record.log_ends)
         self.write_record(record)
         return record
 

@@ -256,8 +256,53 @@ def wait_until_gone(bus: Bus, opening: OpenReply) -> None:
     key = Keys.mapper(opening.mapper, "list")
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
-        (summary,) = bus.query(key, Empty(), SessionList, 10.0).sessions
+        (summary,) = bus.query(key, Empty(), SessionList, 30.0).sessions
         if not summary.is_open:
             return
         time.sleep(0.1)
     raise AssertionError("still open after a minute without a question")
+
+
+@pytest.fixture
+def frozen_and_taken_over(start_at, bus, tmp_path, calibration, entry):
+    """A session whose owner was frozen past its lease and succeeded; the owner is awake again."""
+    first, second = f"first-{tmp_path.name}", f"second-{tmp_path.name}"
+    frozen = start_at(first, tmp_path, "owner.lease_s=1.0")
+    start_at(second, tmp_path, "owner.lease_s=1.0")
+    before = opened(bus, calibration, tmp_path.name, first)
+    for seq in range(5):
+        advance(bus, before, entry(seq))
+    with pytest.raises(ConflictError, match=f"owned by {first}@"):
+        opened(bus, session=tmp_path.name, mapper=second)
+    frozen.send_signal(signal.SIGSTOP)
+    after = opened_in_time(bus, tmp_path.name, second)
+    frozen.send_signal(signal.SIGCONT)
+    return before, after
+
+
+def test_a_frozen_owner_is_succeeded_when_its_lease_ends(frozen_and_taken_over, bus, entry):
+    before, after = frozen_and_taken_over
+
+    assert after.epoch > before.epoch
+    assert after.keyframe_poses.seqs.tolist() == [0, 4]
+    assert advance(bus, after, entry(5)).acknowledged_seq == 5
+
+
+def test_a_woken_owner_acknowledges_nothing_and_steps_down(frozen_and_taken_over, bus, entry):
+    before, after = frozen_and_taken_over
+
+    with pytest.raises(GoneError):
+        advance(bus, before, entry(5))
+
+    wait_until_gone(bus, before)
+    assert advance(bus, after, entry(5)).acknowledged_seq == 5
+
+
+def opened_in_time(bus: Bus, session: str, mapper: str) -> OpenReply:
+    deadline = time.monotonic() + 60.0
+    while True:
+        try:
+            return opened(bus, session=session, mapper=mapper)
+        except ConflictError:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)

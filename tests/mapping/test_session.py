@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ import torch
 
 from services.mapping.config import MappingConfig, OwnerConfig
 from services.mapping.session import Session, Surroundings
-from services.mapping.storage import SessionFolder, SessionRecord
+from services.mapping.storage import SessionFolder, SessionRecord, read_record
+from services.mapping.tenure import Lease
 from shared import se3
-from shared.errors import ConflictError, InputError, UnavailableError
+from shared.errors import ConflictError, GoneError, InputError, UnavailableError
 from shared.maps import ExportFormat, ExportRequest, RefineRequest, RenderRequest
 from shared.tracks import ContextRequest
 
@@ -39,13 +41,16 @@ def open_session(tmp_path, record, published):
         "m0", CONFIG, torch.device("cpu"), lambda session, poses: published.append(poses)
     )
     opened = []
+    epochs: dict[Path, int] = {}
 
     def make(name: str = "room", mode: str = "offline") -> Session:
         path = tmp_path / name
         folder = SessionFolder(path)
         if not (path / "session.msgpack").exists():
             folder.write_record(replace(record, mode=mode))
-        opened.append(Session(folder, surroundings))
+        epochs[path] = epoch = read_record(path).epoch + 1
+        lease = Lease(name, epoch, lambda: epoch == epochs[path])
+        opened.append(Session(folder, lease, surroundings))
         return opened[-1]
 
     yield make
@@ -255,11 +260,27 @@ def test_a_render_with_a_pose_that_is_no_number_is_refused(open_session):
         session.render(RenderRequest(np.full((4, 4), np.nan), intrinsics))
 
 
-def test_a_second_owner_is_refused(open_session, tmp_path):
-    open_session()
+def test_an_owner_whose_epoch_is_over_acknowledges_nothing(open_session, entry):
+    old = open_session()
+    old.advance(entry(0))
+    new = open_session()
 
-    with pytest.raises(ConflictError, match="open in another process"):
-        SessionFolder(tmp_path / "room")
+    with pytest.raises(GoneError, match="epoch 1 is over"):
+        old.advance(entry(1))
+    with pytest.raises(GoneError):
+        old.save()
+
+    assert new.ledger.entries == 1
+
+
+def test_what_a_former_owner_still_writes_is_no_part_of_the_session(open_session, entry):
+    old = open_session()
+    old.advance(entry(0))
+    open_session().close(is_saved=False)
+
+    old.ledger.append(entry(1))  # frozen between the check of its lease and the write
+
+    assert open_session().ledger.entries == 1
 
 
 def test_the_exported_folder_is_a_session_again(open_session, entry, tmp_path):

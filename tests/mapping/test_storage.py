@@ -84,7 +84,17 @@ def test_what_a_broken_removal_left_can_be_cleared(written):
 
     folder.clear()
 
-    assert [path.name for path in written.parent.iterdir()] == ["lock"]
+    assert list(written.parent.iterdir()) == []
+
+
+def test_a_log_is_read_up_to_the_end_that_its_next_owner_found(written):
+    end = written.stat().st_size
+    log = SessionLog(written)
+    log.append(next(read_log(written)))
+    log.close()
+
+    assert len(list(read_log(written, end))) == 5
+    assert count_keyframes(written, end) == 2
 
 
 def test_damage_before_the_last_entry_is_an_error(written):
