@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -60,12 +61,16 @@ class Frame:
     T_odom_camera: Pose | None = None
     may_be_keyframe: bool = True
 
+    def digest(self) -> int:
+        """CRC-32 of both images: a frame that has that of the one before it is a repeat."""
+        return zlib.crc32(self.depth.bytes, zlib.crc32(self.rgb.bytes))
+
 
 class TrackingStatus(StrEnum):
     """How a frame was answered."""
 
     TRACKED = "TRACKED"
-    COARSE_ONLY = "COARSE_ONLY"  # registered by geometry alone; features could not confirm it
+    COARSE_ONLY = "COARSE_ONLY"  # by geometry or by features alone; the other could not confirm it
     RELOCALISED = "RELOCALISED"
     LOST = "LOST"
     SUPERSEDED = "SUPERSEDED"  # live mode: a newer frame came while this one waited
@@ -93,6 +98,7 @@ class Prior:
     lost_frames: int  # frames without a pose since then
     frames_since_keyframe: int
     T_odom_camera: Pose | None = None
+    frame_digest: int | None = None  # of that frame
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
         lost_frames=0,
         frames_since_keyframe=0 if is_keyframe else since,
         T_odom_camera=frame.T_odom_camera,
+        frame_digest=frame.digest(),
     )
 
 

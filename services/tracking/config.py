@@ -112,6 +112,7 @@ class VerificationConfig:
     min_overlap: float = 0.15
     depth_tolerance_m: float = 0.03
     depth_tolerance_per_m2: float = 0.01
+    seen_min_inlier_share: float = 0.5  # without depth
     coarse_min_agreement: float = 0.85  # without features
     coarse_min_overlap: float = 0.08
     coarse_max_step_m: float = 0.3  # from the prediction
@@ -140,7 +141,9 @@ class KeyframeRuleConfig:
     max_interval: int = 10  # frames, for mapping
     min_landmark_share: float = 0.35  # of its features with depth that match a landmark
     max_cloud_points: int = 12000
-    min_points: int = 500  # of a map's first keyframe
+    min_points: int = 500  # with depth: less brings nothing to the map
+    max_std_m: float = 0.03  # of its pose, in the direction that is known least
+    max_std_deg: float = 1.5
     min_step_m: float = 0.02  # from the reference keyframe: less is the same view again
     min_turn_deg: float = 1.0
     max_turn_deg: float = 15.0

@@ -48,7 +48,7 @@ class Estimate:
     def score(self) -> float:
         """To choose between attempts at the same frame."""
         evidence = (10.0 + self.inliers) * (0.05 + self.registration.overlap)
-        return evidence * self.agreement.share**2
+        return evidence * self.agreement.belief**2
 
     def landmark_ids(self, num_features: int) -> NDArray[np.int64]:
         """Landmark of each feature of the frame, NO_LANDMARK where none, [M]."""

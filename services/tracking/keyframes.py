@@ -31,6 +31,7 @@ from shared.tracks import (
 class Coverage:
     """How well the map around already shows what a frame sees."""
 
+    num_points: int  # of the frame's surface
     overlap: float  # share of the frame's surface that the map has
     landmark_share: float  # share of its features with depth that are landmarks
     T_reference_camera: NDArray[np.float64]  # [4, 4]
@@ -69,11 +70,17 @@ def is_too_blurred(
 def becomes_keyframe(
     frame: Frame, prior: Prior, coverage: Coverage, config: KeyframeRuleConfig
 ) -> bool:
-    """GS-ICP's overlap and interval rules and ORB-SLAM's feature rule; never a repeated view."""
+    """GS-ICP's overlap and interval rules and ORB-SLAM's feature rule.
+
+    Never a repeated view, and never one without enough depth to bring anything.
+    """
     step_m = float(np.linalg.norm(coverage.T_reference_camera[:3, 3]))
     turn_deg = float(np.degrees(angle_rad(coverage.T_reference_camera)))
     moved = step_m > config.min_step_m or turn_deg > config.min_turn_deg
-    if not (frame.may_be_keyframe and moved):
+    is_repeat = prior.frame_digest == frame.digest()
+    if is_repeat or not (frame.may_be_keyframe and moved):
+        return False
+    if coverage.num_points < config.min_points:
         return False
     return (
         coverage.overlap < config.min_overlap
@@ -82,6 +89,13 @@ def becomes_keyframe(
         or turn_deg > config.max_turn_deg
         or step_m > config.max_step_share * coverage.median_depth_m
     )
+
+
+def is_well_known(covariance: NDArray[np.float64], config: KeyframeRuleConfig) -> bool:
+    """Whether a pose is certain enough in every direction to hold a part of the map."""
+    metres = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    degrees = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+    return metres <= config.max_std_m and degrees <= config.max_std_deg
 
 
 def keyframe_observations(

@@ -19,6 +19,7 @@ from services.tracking.keyframes import (
     KeyframeParts,
     becomes_keyframe,
     is_too_blurred,
+    is_well_known,
     keyframe_data,
     keyframe_observations,
     nearest_reference,
@@ -136,6 +137,8 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
     coverage = _coverage(observed, estimate)
+    if not is_well_known(_covariance(estimate.information), config.keyframe):
+        return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
         return None
     sharpness = sharpness_of(observed.image, estimate.local.context.window)
@@ -155,6 +158,7 @@ def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
     with_depth = int((observed.features.depths_m > 0.0).sum())
     T_world_reference = estimate.local.context.T_world_reference
     return Coverage(
+        num_points=len(observed.cloud.points),
         overlap=estimate.registration.overlap,
         landmark_share=estimate.inliers / max(1, with_depth),
         T_reference_camera=inverse(T_world_reference) @ estimate.T_world_camera,

@@ -12,7 +12,9 @@ _MAX_EXTRAPOLATION = 3.0
 
 
 def predict(prior: Prior, frame: Frame) -> NDArray[np.float64]:
-    """Expected pose of a frame, T_world_camera, [4, 4]."""
+    """Expected pose of a frame, T_world_camera, [4, 4]; a repeat is expected where it was."""
+    if prior.frame_digest == frame.digest():
+        return prior.T_world_camera.copy()
     if prior.T_odom_camera is not None and frame.T_odom_camera is not None:
         last, now = prior.T_odom_camera.matrix(), frame.T_odom_camera.matrix()
         return prior.T_world_camera @ inverse(last) @ now

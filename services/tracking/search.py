@@ -74,6 +74,8 @@ def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
     config = job.config.verification
     if is_sure(first, config) or is_as_predicted(first, predicted, config):
         return first
+    if is_only_seen(first, config):
+        return first
     starts = [job.locate(local), prior.T_world_camera.copy()]
     others = [job.attempt(local, T) for T in starts if T is not None]
     return max([first, *others], key=lambda estimate: estimate.score)
@@ -89,7 +91,9 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
     if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
         return TrackingStatus.TRACKED
     T_predicted = predict(prior, job.request.frame)
-    if prior.lost_frames == 0 and is_coarse(estimate, T_predicted, config):
+    if prior.lost_frames > 0:
+        return TrackingStatus.LOST
+    if is_coarse(estimate, T_predicted, config) or (is_possible and is_only_seen(estimate, config)):
         return TrackingStatus.COARSE_ONLY
     return TrackingStatus.LOST
 
@@ -125,6 +129,15 @@ def is_confirmed(estimate: Estimate, config: VerificationConfig) -> bool:
         and estimate.inlier_share >= config.min_inlier_share
         and estimate.agreement.share >= config.min_agreement
         and estimate.registration.overlap >= config.min_overlap
+    )
+
+
+def is_only_seen(estimate: Estimate, config: VerificationConfig) -> bool:
+    """An image without depth: its features alone hold the pose."""
+    return (
+        estimate.agreement.is_silent
+        and estimate.inliers >= config.sure_inliers_near
+        and estimate.inlier_share >= config.seen_min_inlier_share
     )
 
 

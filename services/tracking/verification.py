@@ -21,6 +21,17 @@ class Agreement:
     share: float  # on the surface, of those not hidden behind it
     visible_share: float  # on the surface, of all that fall into the image
     points: int  # on the surface
+    compared: int  # fall where there is depth
+
+    @property
+    def is_silent(self) -> bool:
+        """Hardly anything could be compared."""
+        return self.compared < _MIN_COMPARED
+
+    @property
+    def belief(self) -> float:
+        """The share; neither for nor against where depth is silent."""
+        return 0.5 if self.is_silent else self.share
 
 
 def depth_agreement(
@@ -39,9 +50,11 @@ def depth_agreement(
         np.array([i.fx, i.fy, i.cx, i.cy]),
         np.array([config.depth_tolerance_m, config.depth_tolerance_per_m2]),
     )
-    return Agreement(on / max(1, on + front), on / max(1, on + front + behind), on)
+    compared = on + front + behind
+    return Agreement(on / max(1, on + front), on / max(1, compared), on, compared)
 
 
+_MIN_COMPARED = 50  # points of the map; with fewer, depth says nothing
 _CLOUD_STEP = 4  # a share needs not all of the points
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.gateway.prior import next_prior
 from services.mapping.keyframes import KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.executors import NoHelper
@@ -16,7 +17,6 @@ from services.tracking.local_map import LocalMap, derive
 from services.tracking.pipeline import track
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import (
-    HAS_POSE,
     ColourEncoding,
     ColourImage,
     DepthEncoding,
@@ -26,7 +26,6 @@ from shared.frames import (
     TrackRequest,
 )
 from shared.rectify import RgbdImage
-from shared.se3 import inverse
 from shared.tracks import Candidates, CandidatesRequest, TrackResult
 
 CAMERA = Intrinsics(260.0, 260.0, 159.5, 119.5, 320, 240)
@@ -117,27 +116,8 @@ class Session:
         result = self.answer(frame)
         if result.keyframe is not None:
             self.store.insert(result.seq, result.t_ns, result.T_world_camera, result.keyframe)
-        self.prior = self._next_prior(result)
+        self.prior = next_prior(self.prior, frame, result)
         return result
-
-    def _next_prior(self, result: TrackResult) -> Prior | None:
-        before = self.prior
-        if result.status not in HAS_POSE:
-            return before and replace(before, lost_frames=before.lost_frames + 1)
-        T = result.T_world_camera
-        return Prior(
-            seq=result.seq,
-            t_ns=result.t_ns,
-            T_world_camera=T,
-            T_before_last=inverse(before.T_world_camera) @ T if before else np.eye(4),
-            before_last_dt_ns=result.t_ns - before.t_ns if before else 0,
-            reference_seq=result.reference_seq,
-            newest_keyframe_seq=self.store.seqs()[-1],
-            lost_frames=0,
-            frames_since_keyframe=0
-            if result.keyframe is not None or before is None
-            else before.frames_since_keyframe + 1,
-        )
 
 
 @pytest.fixture(scope="session")

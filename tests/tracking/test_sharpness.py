@@ -61,7 +61,7 @@ def test_an_image_without_edges_has_no_blur_to_speak_of():
 
 
 def covered(overlap: float) -> Coverage:
-    return Coverage(overlap, 0.5, np.eye(4), 2.0)
+    return Coverage(9000, overlap, 0.5, np.eye(4), 2.0)
 
 
 @pytest.mark.parametrize(("edge_blur", "refused"), [(1.2, False), (1.8, False), (2.4, True)])

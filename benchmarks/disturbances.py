@@ -1,0 +1,126 @@
+"""A sequence folder as a bad day would deliver it: repeats, losses, black depth, another place.
+
+Frames are played to and fro until there are enough of them, so that any sequence will do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.camera import Calibration
+from shared.frames import DepthEncoding, Frame
+from shared.images import decode_colour, decode_depth, encode_depth, encode_jpeg
+
+
+class Sequence(Protocol):
+    """Frames with their true poses, as `benchmarks.tracking.Folder` has them."""
+
+    calibration: Calibration
+
+    def __len__(self) -> int: ...
+
+    def frame(self, index: int) -> Frame:
+        """One frame."""
+        ...
+
+    def true_pose(self, index: int) -> NDArray[np.float64]:
+        """T_world_camera, [4, 4]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What goes wrong, and when; counts are of frames."""
+
+    frames: int = 500
+    repeat_every: int = 7  # sent twice
+    drop_every: int = 50
+    black_every: int = 10  # the whole depth image is black
+    black_share: float = 0.1  # of every other depth image, in patches
+    away_from: int = 300  # the camera is elsewhere from here on
+    away_for: int = 60  # two seconds at 30 Hz
+    period_ns: int = 33_000_000
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A frame as it is sent, and what it shows: an index of the sequence, None for elsewhere."""
+
+    frame: Frame
+    index: int | None
+    is_repeat: bool = False
+
+
+def disturbed(folder: Sequence, elsewhere: Sequence, plan: Plan) -> Iterator[Sent]:
+    """The frames of a folder with everything of the plan done to them."""
+    rng = np.random.default_rng(plan.seed)
+    shown = Sent(_holed(folder, 0, plan, rng), 0)
+    step = 0
+    for seq in range(plan.frames):
+        if plan.away_from <= seq < plan.away_from + plan.away_for:
+            yield _elsewhere(folder, elsewhere, seq, plan)
+            continue
+        is_repeat = seq % plan.repeat_every == plan.repeat_every - 1
+        if not is_repeat:
+            shown = Sent(_holed(folder, step, plan, rng), to_and_fro(step, len(folder)))
+            step += 1
+        if seq % plan.drop_every != plan.drop_every - 1:
+            yield Sent(_stamped(shown.frame, seq, plan), shown.index, is_repeat)
+
+
+def to_and_fro(step: int, length: int) -> int:
+    """Index of a sequence that is played forwards, backwards, forwards, ..."""
+    step %= max(1, 2 * length - 2)
+    return step if step < length else 2 * length - 2 - step
+
+
+def _stamped(frame: Frame, seq: int, plan: Plan) -> Frame:
+    return dataclasses.replace(frame, seq=seq, t_ns=seq * plan.period_ns, may_be_keyframe=True)
+
+
+def _black(
+    shape: tuple[int, ...], step: int, plan: Plan, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Pixels without depth: all of them, or patches of a sixth of the image's sides."""
+    if step % plan.black_every == plan.black_every - 1:
+        return np.ones(shape, np.bool_)
+    black = np.zeros(shape, np.bool_)
+    height, width = shape[0] // 6, shape[1] // 6
+    while black.mean() < plan.black_share:
+        v, u = rng.integers(shape[0] - height), rng.integers(shape[1] - width)
+        black[v : v + height, u : u + width] = True
+    return black
+
+
+def _holed(folder: Sequence, step: int, plan: Plan, rng: np.random.Generator) -> Frame:
+    """A frame of the folder that lacks some of its depth."""
+    frame = folder.frame(to_and_fro(step, len(folder)))
+    depth_m = decode_depth(frame.depth, folder.calibration)
+    depth_m[_black(depth_m.shape, step, plan, rng)] = 0.0
+    return _with_depth(frame, depth_m, folder.calibration)
+
+
+def _with_depth(frame: Frame, depth_m: NDArray[np.float32], calibration: Calibration) -> Frame:
+    raw = np.round(depth_m * calibration.depth_scale).astype(np.uint16)
+    return dataclasses.replace(frame, depth=encode_depth(raw, DepthEncoding.RAW16))
+
+
+def _elsewhere(folder: Sequence, elsewhere: Sequence, seq: int, plan: Plan) -> Sent:
+    """A frame of another sequence in this one's size and depth scale."""
+    other = elsewhere.frame(to_and_fro(seq - plan.away_from, len(elsewhere)))
+    size = folder.calibration.colour.intrinsics
+    rgb = decode_colour(other.rgb, elsewhere.calibration.colour.intrinsics)
+    rgb = cv2.resize(rgb, (size.width, size.height)).astype(np.uint8)
+    depth_m = decode_depth(other.depth, elsewhere.calibration)
+    depth_m = cv2.resize(depth_m, (size.width, size.height), interpolation=cv2.INTER_NEAREST)
+    frame = dataclasses.replace(other, rgb=encode_jpeg(rgb))
+    frame = _with_depth(frame, np.asarray(depth_m, np.float32), folder.calibration)
+    return Sent(_stamped(frame, seq, plan), None)
