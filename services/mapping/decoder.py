@@ -92,7 +92,7 @@ def weight_optimizer(weights: Weights, rates: LearningRates) -> torch.optim.Adam
         for name in WEIGHTS
         for rate in (per_network[name.split("_")[0]],)
     ]
-    return torch.optim.Adam(groups, eps=1e-15)
+    return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 
 def decode(

@@ -24,6 +24,7 @@ from services.mapping.decoder_kernels import (
 from services.mapping.decoder_kernels_backward import decode_chunks_backward
 from services.mapping.lane_products import COLUMNS
 from services.mapping.rasterizer import Gaussians
+from services.mapping.rasterizer.scratch import scratch
 from services.mapping.rasterizer.threads import default_threads, workers
 
 Array = NDArray[np.float32]
@@ -56,7 +57,7 @@ class _Decode(torch.autograd.Function):
         count, hidden = len(positions) // 3, len(networks.hidden_bias) // 3
         shape = Shape(count, len(networks.opacity_bias), hidden)
         each = count * shape.children
-        out = Children(*(np.empty(each * width, np.float32) for width in _WIDTHS))
+        out = Children(*(scratch().borrow(each * width) for width in _WIDTHS))
         ctx.scene, ctx.out = Scene(rows, camera, networks, shape), out
         _run(decode_chunks, ctx.scene, out)
         return tuple(
@@ -68,7 +69,7 @@ class _Decode(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
         rows, _, networks, shape = ctx.scene
-        down = AnchorRows(rows.positions, *(np.empty_like(column) for column in rows[1:]))
+        down = AnchorRows(rows.positions, *(scratch().borrow(column.size) for column in rows[1:]))
         chunks = -(-shape.anchors // COLUMNS)
         slopes = Networks(*(np.empty((chunks, w.size), np.float32) for w in networks))
         passed = ctx.out, Children(*map(_flat, gradients)), down, slopes

@@ -17,6 +17,7 @@ from services.mapping.config import LossConfig
 from services.mapping.losses import Appearance, Loss, Target
 from services.mapping.losses_kernels import PIECE, Images, Look, compare, compare_back
 from services.mapping.rasterizer import Rendered
+from services.mapping.rasterizer.scratch import scratch
 from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import default_threads, workers
 
@@ -48,7 +49,7 @@ class _Compare(torch.autograd.Function):
         images = Images(*map(_whole_vectors, columns), pixels=count)
         gain, bias = exposure.detach().numpy()
         look = Look(background, gain, bias, np.float32(max_error))
-        image, sums = np.empty(_room(count) * 3, np.float32), _sums(count)
+        image, sums = scratch().borrow(_room(count) * 3), _sums(count)
         workers(default_threads()).run(compare, images, look, image, sums)
         ctx.images, ctx.look, ctx.shape = images, look, alpha.shape
         total = sums.sum(0, dtype=np.float64)[:3] / (-3 * count, 3 * count, -count)
@@ -63,8 +64,8 @@ class _Compare(torch.autograd.Function):
         by_image, by_colour, _, by_depth = gradients
         count, room = ctx.images.pixels, _room(ctx.images.pixels)
         weights = np.float32(by_colour / (3 * count)), np.float32(by_depth / count)
-        images = np.empty(room * 3, np.float32), np.empty(room, np.float32)
-        down = *images, np.empty(room, np.float32), _sums(count)
+        borrow = scratch().borrow
+        down = borrow(room * 3), borrow(room), borrow(room), _sums(count)
         slopes = _whole_vectors(by_image), *weights
         workers(default_threads()).run(compare_back, ctx.images, ctx.look, slopes, down)
         by_exposure = down[3].sum(0, dtype=np.float64)[:6].astype(np.float32).reshape(2, 3)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from services.mapping.losses import MIN_DEPTH_ALPHA
 from services.mapping.rasterizer.memory import fetch_add, load, store
+from services.mapping.rasterizer.places import ramp
 from services.mapping.rasterizer.shuffles import lane_sums, load_three, store_three
 from services.mapping.rasterizer.simd import (
     LANES,
@@ -16,7 +17,6 @@ from services.mapping.rasterizer.simd import (
     kernel,
     maximum,
     negative_magnitude,
-    ramp,
     select,
     splat,
 )

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from services.mapping.rasterizer.memory import fetch_add
+from services.mapping.rasterizer.threads import default_threads, workers
 from services.mapping.rows import RowTable
-from services.mapping.workers import in_pieces
 
 BETA_MEAN = 0.9
 BETA_SQUARE = 0.999
 EPSILON = 1e-12
-_PIECE = 4096
+_PIECE = 1024
 
 
 @dataclass(frozen=True)
@@ -24,16 +25,33 @@ class RowStep:
 
     rows: RowTable
     index: Tensor  # [V], without repeats
-    corrections: Tensor  # [V, 2], bias corrections 1 / (1 - beta^t) of mean and square
+    rates: Tensor  # [V], of the row, over 1 - beta^t of the mean
+    corrections: Tensor  # [V], 1 / (1 - beta^t) of the square
 
 
 def begin_step(rows: RowTable, index: Tensor) -> RowStep:
     """Count one more step for the rows `index` [V]."""
+    if index.device.type == "cpu":
+        rates, corrections = torch.empty(len(index)), torch.empty(len(index))
+        columns = rows["steps"].numpy(), rows["rate"].numpy()
+        _begin_kernel(index.numpy(), columns, rates.numpy(), corrections.numpy())
+        return RowStep(rows, index, rates, corrections)
     steps = rows["steps"][index] + 1
     rows["steps"][index] = steps
     t = steps.double()
-    corrections = torch.stack([1.0 / (1.0 - BETA_MEAN**t), 1.0 / (1.0 - BETA_SQUARE**t)], 1)
-    return RowStep(rows, index, corrections.float())
+    rates = rows["rate"][index] / (1.0 - BETA_MEAN**t)
+    return RowStep(rows, index, rates.float(), (1.0 / (1.0 - BETA_SQUARE**t)).float())
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _begin_kernel(index, columns, rates, corrections):  # pragma: no cover - compiled
+    """Count a step of each row; rates and corrections as in `RowStep`."""
+    steps, row_rates = columns
+    for row in range(index.size):
+        i = index[row]
+        steps[i] += 1
+        rates[row] = row_rates[i] / (1.0 - BETA_MEAN ** steps[i])
+        corrections[row] = 1.0 / (1.0 - BETA_SQUARE ** steps[i])
 
 
 def adam_rows(step: RowStep, name: str, gradient: Tensor, rate: float) -> None:
@@ -54,36 +72,34 @@ def adam_rows_torch(step: RowStep, name: str, gradient: Tensor, rate: float) -> 
     square = rows[f"{name}_square"][index].lerp(gradient * gradient, 1.0 - BETA_SQUARE)
     rows[f"{name}_mean"][index] = mean
     rows[f"{name}_square"][index] = square
-    change = corrections[:, :1] * mean / ((square * corrections[:, 1:]).sqrt() + EPSILON)
-    rows[name][index] -= rate * rows["rate"][index, None] * change
+    change = step.rates[:, None] * mean / ((square * corrections[:, None]).sqrt() + EPSILON)
+    rows[name][index] -= rate * change
 
 
 def _adam_cpu(step: RowStep, name: str, slope: Tensor, rate: float) -> None:
     rows, index, gradient = step.rows, step.index.numpy(), slope.numpy()
-    value, mean, square = (rows[f"{name}{end}"].numpy() for end in ("", "_mean", "_square"))
-    rates = (rate * rows["rate"][step.index] * step.corrections[:, 0]).numpy()
-    squares = step.corrections[:, 1].numpy()
-
-    def work(start: int, stop: int) -> None:
-        part = index[start:stop], gradient[start:stop], rates[start:stop], squares[start:stop]
-        _adam_kernel(part, (value, mean, square))
-
-    in_pieces(work, len(index), _PIECE)
+    columns = tuple(rows[f"{name}{end}"].numpy() for end in ("", "_mean", "_square"))
+    part = index, gradient, step.rates.numpy(), step.corrections.numpy()
+    workers(default_threads()).run(_adam_kernel, part, columns, np.float32(rate))
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _adam_kernel(part, columns):  # pragma: no cover - compiled
+def _adam_kernel(part, columns, rate, counter):  # pragma: no cover - compiled
     """Rows of (index, gradient, rate, correction) into the columns (value, mean, square)."""
     index, gradient, rates, corrections = part
     value, mean, square = columns
     one = np.float32(1.0)
     b1, b2, epsilon = np.float32(BETA_MEAN), np.float32(BETA_SQUARE), np.float32(EPSILON)
-    for row in range(index.size):
-        i = index[row]
-        for d in range(gradient.shape[1]):
-            g = gradient[row, d]
-            m = b1 * mean[i, d] + (one - b1) * g
-            v = b2 * square[i, d] + (one - b2) * g * g
-            mean[i, d] = m
-            square[i, d] = v
-            value[i, d] -= rates[row] * m / (np.sqrt(v * corrections[row]) + epsilon)
+    while True:
+        start = fetch_add(counter, 0, _PIECE)
+        if start >= index.size:
+            return
+        for row in range(start, min(start + _PIECE, index.size)):
+            i, row_rate = index[row], rate * rates[row]
+            for d in range(gradient.shape[1]):
+                g = gradient[row, d]
+                m = b1 * mean[i, d] + (one - b1) * g
+                v = b2 * square[i, d] + (one - b2) * g * g
+                mean[i, d] = m
+                square[i, d] = v
+                value[i, d] -= row_rate * m / (np.sqrt(v * corrections[row]) + epsilon)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from services.mapping.rasterizer.scratch import scratch
 from services.mapping.rasterizer.threads import default_threads, workers
 from services.mapping.ssim_kernels import (
     Layout,
@@ -115,7 +116,7 @@ class _Ssim(torch.autograd.Function):
     ) -> tuple[Tensor, None, None]:
         layout = ctx.target.layout
         scale = np.float32(gradients[0].item() / (3 * layout.height * layout.width))
-        result = np.empty((layout.height, layout.width, 3), np.float32)
+        result = scratch().borrow(layout.height * layout.width * 3)
         sources = (ctx.pixels, ctx.target.target.pixels), ctx.slopes
-        _run(ctx.threads, spread_back, sources, layout, scale, result.reshape(-1))
-        return torch.from_numpy(result), None, None
+        _run(ctx.threads, spread_back, sources, layout, scale, result)
+        return torch.from_numpy(result).view(layout.height, layout.width, 3), None, None

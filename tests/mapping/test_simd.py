@@ -21,6 +21,7 @@ from services.mapping.rasterizer.memory import (
     strided,
 )
 from services.mapping.rasterizer.places import (
+    ramp,
     round_down,
     round_up,
     split_exponent,
@@ -46,7 +47,6 @@ from services.mapping.rasterizer.simd import (
     maximum,
     minimum,
     negative_magnitude,
-    ramp,
     select,
     splat,
     square_root,

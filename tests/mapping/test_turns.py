@@ -6,7 +6,6 @@ import threading
 import time
 
 from services.mapping.turns import Turns
-from services.mapping.workers import in_pieces
 
 
 def test_a_visitor_waits_for_one_step_at_most():
@@ -48,9 +47,3 @@ def test_turns_exclude_each_other():
         thread.join()
 
     assert max(overlaps) == 1
-
-
-def test_pieces_come_back_in_order_and_cover_everything():
-    pieces = in_pieces(lambda start, stop: (start, stop), 10, 4)
-
-    assert pieces == [(0, 4), (4, 8), (8, 10)]

@@ -30,7 +30,7 @@ from services.mapping.rasterizer.projection_backward import (
     project_backward,
 )
 from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
-from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.scratch import Scratch, scratch
 from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import Workers, default_threads, workers
 from services.mapping.rasterizer.tiles_backward import blend_tiles_backward
@@ -44,7 +44,7 @@ class CpuRasterizer:
     """
 
     def __init__(self, threads: int | None = None, pool: Workers | None = None) -> None:
-        self._engine = Engine(pool or workers(threads or default_threads()), Scratch())
+        self._engine = Engine(pool or workers(threads or default_threads()), scratch())
 
     def __call__(self, gaussians: Gaussians, view: View) -> Rendered:
         """Render the Gaussians; see `scene` for the definition.

@@ -19,6 +19,12 @@ _INTS = ir.VectorType(ir.IntType(32), LANES)
 
 
 @intrinsic
+def ramp(typing_context):
+    """The lanes 0, 1, 2 ..."""
+    return fixed(range(LANES))
+
+
+@intrinsic
 def strip_columns(typing_context):
     """The column of each lane of a strip: 0 to 7, in every row."""
     return fixed(lane % STRIP_COLUMNS for lane in range(LANES))

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 CACHE_LINE = 64  # bytes; a record that straddled two would cost two
-_MOST = 48  # arrays kept; two forward and backward passes have fewer
+_MOST = 96  # arrays kept; two whole iterations of the mapper have fewer
 
 
 class Scratch:
@@ -50,3 +51,9 @@ class Scratch:
             self._free.append(memory)
         memory = np.empty(num_bytes + num_bytes // 4 + CACHE_LINE, np.uint8)
         return memory[-memory.ctypes.data % CACHE_LINE :]
+
+
+@cache
+def scratch() -> Scratch:
+    """The process's arrays."""
+    return Scratch()

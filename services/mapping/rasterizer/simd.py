@@ -62,8 +62,8 @@ _BITS = ir.VectorType(ir.IntType(1), LANES)
 def kernel(function: Callable) -> Any:
     """Compile a function that Python calls; it runs without the interpreter lock.
 
-    The compiled code is cached on disk. Numba would renew it only when the function's own file
-    changes, and not when what it inlines does: the stamp covers this whole folder.
+    The code is cached on disk, and renewed when any file of kernels changes: Numba's own stamp
+    would not see a change in what the function inlines.
     """
     dispatcher: Any = _njit(cache=True, **_OPTIONS)(function)
     cache_file = dispatcher._cache._cache_file
@@ -73,7 +73,9 @@ def kernel(function: Callable) -> Any:
 
 @cache
 def _newest_source_ns() -> int:
-    return max(path.stat().st_mtime_ns for path in Path(__file__).parent.glob("*.py"))
+    patterns = "rasterizer/*.py", "*_kernels*.py", "lane_*.py"
+    files = (file for each in patterns for file in Path(__file__).parents[1].glob(each))
+    return max(file.stat().st_mtime_ns for file in files)
 
 
 def inlined(function: Callable) -> Any:
@@ -222,12 +224,6 @@ def fixed(numbers):
 
 
 @intrinsic
-def ramp(typing_context):
-    """The lanes 0, 1, 2 ..."""
-    return fixed(range(LANES))
-
-
-@intrinsic
 def select(typing_context, mask, chosen, otherwise):
     """`chosen` in the lanes where the mask holds, `otherwise` in the others."""
 
@@ -239,26 +235,26 @@ def select(typing_context, mask, chosen, otherwise):
     return floats(mask, chosen, otherwise), generate
 
 
-@intrinsic
-def minimum(typing_context, x, y):
-    """The lesser of both, lane by lane; `y` where one of them is NaN."""
+def _chosen(sign: str) -> Callable:
+    """Code for the operand that stands in this relation to the other; the second for NaN."""
 
     def generate(context, builder, sig, args):
         left, right = _pair(context, builder, sig, args)
-        return builder.select(builder.fcmp_ordered("<", left, right), left, right)
+        return builder.select(builder.fcmp_ordered(sign, left, right), left, right)
 
-    return floats(x, y), generate
+    return generate
+
+
+@intrinsic
+def minimum(typing_context, x, y):
+    """The lesser of both, lane by lane; `y` where one of them is NaN."""
+    return floats(x, y), _chosen("<")
 
 
 @intrinsic
 def maximum(typing_context, x, y):
     """The greater of both, lane by lane; `y` where one of them is NaN."""
-
-    def generate(context, builder, sig, args):
-        left, right = _pair(context, builder, sig, args)
-        return builder.select(builder.fcmp_ordered(">", left, right), left, right)
-
-    return floats(x, y), generate
+    return floats(x, y), _chosen(">")
 
 
 @intrinsic
