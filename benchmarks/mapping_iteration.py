@@ -14,7 +14,7 @@ from torch import Tensor
 from services.mapping.anchors import FEATURES, AnchorMap, NewAnchors, trained_widths
 from services.mapping.config import AnchorConfig, MappingConfig
 from services.mapping.decoders import NeuralDecoder
-from services.mapping.losses import Appearance, Target
+from services.mapping.losses import Appearance, Target, mapping_loss
 from services.mapping.losses_cpu import mapping_loss_cpu
 from services.mapping.optimizer import adam_rows, begin_step
 from services.mapping.rasterizer import Gaussians, Rasterizer, View
@@ -22,6 +22,7 @@ from services.mapping.render import Painter
 from shared.rectify import RgbdImage
 
 CHILDREN = 10  # Gaussians per anchor
+ITERATION_STAGES = "decode", "rasterize", "loss", "backward", "update"
 
 
 @dataclass
@@ -39,7 +40,7 @@ class Stages:
 
 
 class MappingIteration:
-    """The mapper's work on one keyframe of a map of so many Gaussians, CPU only.
+    """The mapper's work on one keyframe of a map of so many Gaussians, on their device.
 
     Each anchor has 10 children in its own frame, as in the mapper; children stand where the given
     Gaussians do and have their colours and, on average, their sizes.
@@ -48,22 +49,24 @@ class MappingIteration:
     def __init__(self, rasterizer: Rasterizer, gaussians: Gaussians, view: View) -> None:
         self._config = MappingConfig(anchors=AnchorConfig(children=CHILDREN))
         self._view, self.stages = view, Stages()
-        anchors = AnchorMap(self._config.anchors, torch.device("cpu"))
+        self._device = device = gaussians.means.device
+        self._loss = mapping_loss_cpu if device.type == "cpu" else mapping_loss
+        anchors = AnchorMap(self._config.anchors, device)
         anchors.append(_anchors(gaussians), creator_seq=0)
-        decoder = NeuralDecoder(self._config, seed=0, device=torch.device("cpu"))
+        decoder = NeuralDecoder(self._config, seed=0, device=device)
         self._painter = Painter(anchors, decoder, rasterizer, self._config.decoder)
         self._target = self._darker()
 
     def run(self) -> None:
         """One step towards an image that is a little darker than the first one."""
-        appearance = Appearance(torch.zeros(3), torch.tensor([[1.0] * 3, [0.0] * 3]))
-        appearance.exposure.requires_grad_()
+        exposure = torch.tensor([[1.0] * 3, [0.0] * 3], device=self._device, requires_grad=True)
+        appearance = Appearance(torch.zeros(3, device=self._device), exposure)
         with self.stages("decode"):
             visible, gaussians = self._painter.decode(self._view, is_trained=True)
         with self.stages("rasterize"):
             rendered = self._painter.rasterizer(gaussians, self._view)
         with self.stages("loss"):
-            loss = mapping_loss_cpu(rendered, self._target, appearance, self._config.loss)
+            loss = self._loss(rendered, self._target, appearance, self._config.loss)
         with self.stages("backward"):
             loss.total.backward()
         with self.stages("update"), torch.no_grad():
@@ -74,10 +77,10 @@ class MappingIteration:
 
     def _darker(self) -> Target:
         rendered = self._painter.draw(self._view).rendered
-        colour = (255.0 * 0.9 * rendered.colour).clamp(0.0, 255.0).to(torch.uint8).numpy()
-        depth = (rendered.depth / rendered.alpha.clamp_min(0.5)).numpy()
+        colour = (255.0 * 0.9 * rendered.colour).clamp(0.0, 255.0).to(torch.uint8).cpu().numpy()
+        depth = (rendered.depth / rendered.alpha.clamp_min(0.5)).cpu().numpy()
         image = RgbdImage(colour, depth, self._view.intrinsics)
-        return Target.of(image, torch.device("cpu"))
+        return Target.of(image, self._device)
 
 
 def _anchors(gaussians: Gaussians) -> NewAnchors:
@@ -102,5 +105,5 @@ def _anchors(gaussians: Gaussians) -> NewAnchors:
 
 def _children(tensor: Tensor) -> np.ndarray:
     """Rows in groups of one anchor each."""
-    rows = tensor.detach().numpy()
+    rows = tensor.detach().cpu().numpy()
     return rows.reshape(len(rows) // CHILDREN, CHILDREN, -1)

@@ -1,30 +1,36 @@
 """Times the rasterizer: a rendering, with gradients, and a whole iteration, by stages.
 
+python -m benchmarks.rasterizer [--json] [--quick] [--device cuda] ...
+
 The scene is a box of walls seen from inside, covered by flat Gaussians about as wide as their
-spacing, which is what a map of a room looks like to a camera in it. An iteration renders,
-compares by L1, SSIM and depth, differentiates, and takes a step of Adam on all Gaussians.
+spacing, which is what a map of a room looks like to a camera in it. An iteration is the mapper's:
+decode the anchors in sight, 10 Gaussians each, render, compare by L1, SSIM and depth,
+differentiate, and take a step of Adam on anchors and networks.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
 
-from benchmarks.plain_rasterizer import blend_pixels, milliseconds, peak_gflops, torch_ssim
+from benchmarks.mapping_iteration import CHILDREN, ITERATION_STAGES, MappingIteration
+from benchmarks.plain_rasterizer import PlainScene, milliseconds, peak_gflops, torch_ssim
 from services.mapping.rasterizer import (
     CpuRasterizer,
     Gaussians,
     GsplatRasterizer,
     Rasterizer,
-    Rendered,
     View,
     warm_up,
 )
@@ -32,13 +38,15 @@ from services.mapping.rasterizer.cpu import Engine
 from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import Workers
+from services.mapping.rasterizer.tiles_forward import Images
 from services.mapping.ssim import SsimTarget, ssim
 from shared.camera import Intrinsics
 
 ROOM_M = np.array([4.0, 2.5, 4.0])
 SIZES = ((320, 240), (640, 480), (1200, 680))
+QUICK_SIZES = ((320, 240),)
 # Operations per blended (Gaussian, pixel) pair, the least that the method needs.
-FORWARD_FLOPS = 27
+FORWARD_FLOPS, BACKWARD_FLOPS = 27, 47
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,9 @@ def main(argv: list[str]) -> int:
 
 
 def _line(row: Row) -> str:
-    stages = ", ".join(f"{name} {value}" for name, value in row.stages_ms.items())
+    kernels = {name: ms for name, ms in row.stages_ms.items() if name not in ITERATION_STAGES}
+    total = sum(kernels.values())
+    stages = ", ".join(f"{name} {100.0 * ms / total:.0f} %" for name, ms in kernels.items())
     return (
         f"{row.backend} {row.gaussians:7d} Gaussians {row.width:4d}x{row.height:<3d} "
         f"{row.threads} threads: forward {row.forward_ms:6.1f} ms, with backward "
@@ -103,13 +113,17 @@ def _line(row: Row) -> str:
 def _options(argv: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="rasterizer", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print rows as JSON")
+    parser.add_argument("--quick", action="store_true", help="one small row per number of threads")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
         "--gaussians", type=int, nargs="+", default=[20_000, 100_000, 200_000], metavar="N"
     )
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], metavar="N")
     parser.add_argument("--repeats", type=int, default=9, help="renderings per median")
-    return parser.parse_args(argv)
+    options = parser.parse_args(argv)
+    if options.quick:
+        options.gaussians, options.repeats = [5_000], 3
+    return options
 
 
 def _measure(options: argparse.Namespace) -> Iterator[Row]:
@@ -118,11 +132,21 @@ def _measure(options: argparse.Namespace) -> Iterator[Row]:
         warm_up()
     for count in options.gaussians:
         gaussians = room(count, options.device)
-        for width, height in SIZES:
+        for width, height in QUICK_SIZES if options.quick else SIZES:
             for threads, rasterizer, pool in _backends(options):
-                times = _time(rasterizer, gaussians, _view(width, height), options.repeats)
-                stages = pool.stages_ms() if pool else {}
+                with _cores(threads):
+                    case = _Case(rasterizer, gaussians, _view(width, height))
+                    times, stages = case.time(options.repeats, pool)
                 yield Row(options.device, count, width, height, threads, *times, stages)
+
+
+@contextmanager
+def _cores(count: int) -> Iterator[None]:
+    """Let everything use so many cores; all for 0. The mapper takes one thread per core."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(allowed)[:count] or allowed)
+    yield
+    os.sched_setaffinity(0, allowed)
 
 
 def _backends(options: argparse.Namespace) -> Iterator[tuple[int, Rasterizer, TimedWorkers | None]]:
@@ -137,25 +161,24 @@ def _backends(options: argparse.Namespace) -> Iterator[tuple[int, Rasterizer, Ti
 def _machine() -> dict[str, float | str]:
     """The processor, and ratios of yardsticks to our kernels, all on one thread."""
     view, gaussians, pool = _view(640, 480), room(100_000), TimedWorkers(1)
-    engine, pixels = Engine(pool, Scratch()), 640 * 480
+    engine = Engine(pool, Scratch())
     frame = engine.prepare(gaussians, view)
-    assert frame.lists is not None
-    tiles = frame.tiles(frame.lists)
     for _ in range(9):
-        engine.blend(frame)
-    ours_ms, plain_ms = (
-        pool.stages_ms()["blend_tiles"],
-        milliseconds(lambda: blend_pixels(tiles), 3),
-    )
-    pairs, peak = blend_pixels(tiles), peak_gflops()
-    floor_ms = 1e-6 * pairs * FORWARD_FLOPS / peak
+        images = Images(*(image.numpy().reshape(-1) for image in engine.blend(frame)))
+        engine.differentiate(frame, images, images)
+    ours = pool.stages_ms()
+    plain = PlainScene.of(frame.projected, frame.camera)
+    plain_ms, pairs, peak = milliseconds(plain.blend, 3), plain.blend(), peak_gflops()
+    pair_ms = 1e-6 * pairs / peak
+    backward_to_floor = ours["blend_tiles_backward"] / (pair_ms * BACKWARD_FLOPS)
     return {
         "processor": platform.processor() or platform.machine(),
         "lanes": LANES,
         "fma_peak_gflops_per_core": round(peak, 1),
-        "pairs_per_pixel": round(pairs / pixels, 1),
-        "forward_blending_to_floor": round(ours_ms / floor_ms, 1),
-        "plain_kernel_to_ours": round(plain_ms / ours_ms, 1),
+        "pairs_per_pixel": round(pairs / (640 * 480), 1),
+        "forward_blending_to_floor": round(ours["blend_tiles"] / (pair_ms * FORWARD_FLOPS), 1),
+        "backward_blending_to_floor": round(backward_to_floor, 1),
+        "plain_kernel_to_ours": round(plain_ms / ours["blend_tiles"], 1),
         "torch_ssim_to_ours": round(_ssim_ratio(), 1),
     }
 
@@ -171,11 +194,19 @@ def _ssim_ratio() -> float:
 
 
 def room(count: int, device: str = "cpu") -> Gaussians:
-    """Flat Gaussians on the walls of a room, in random order; they require gradients."""
+    """Flat Gaussians on the walls of a room; they require gradients.
+
+    Anchors lie in random order, the children of each side by side in memory and in space.
+    """
     rng = np.random.default_rng(0)
-    normals = rng.integers(0, 3, count)
-    means = rng.uniform(-0.5, 0.5, (count, 3))
-    means[np.arange(count), normals] = rng.choice([-0.5, 0.5], count)
+    anchors = -(-count // CHILDREN)
+    normals = rng.integers(0, 3, anchors)
+    centres = rng.uniform(-0.5, 0.5, (anchors, 3))
+    centres[np.arange(anchors), normals] = rng.choice([-0.5, 0.5], anchors)
+    spread = 0.5 / math.sqrt(anchors)
+    means = np.repeat(centres, CHILDREN, axis=0)[:count] + rng.normal(0.0, spread, (count, 3))
+    normals = np.repeat(normals, CHILDREN)[:count]
+    means[np.arange(count), normals] = np.round(means[np.arange(count), normals] + 0.5) - 0.5
     area = 2.0 * (ROOM_M.prod() / ROOM_M).sum()
     scales = 0.6 * np.sqrt(area / count) * np.exp(rng.normal(0.0, 0.25, (count, 3)))
     scales[np.arange(count), normals] *= 0.3
@@ -194,49 +225,41 @@ def _view(width: int, height: int) -> View:
     return View(T_camera_world, Intrinsics(focal, focal, *centre, width, height))
 
 
-def _time(
-    rasterizer: Rasterizer, gaussians: Gaussians, view: View, repeats: int
-) -> tuple[float, float, float]:
-    """Median milliseconds of forward, forward and backward together, and an iteration."""
-    forward, both, iteration = [], [], []
-    step = _Iteration(rasterizer, gaussians, view)
-    for _ in range(repeats + 2):
+@dataclass(frozen=True)
+class _Case:
+    """One line's work."""
+
+    rasterizer: Rasterizer
+    gaussians: Gaussians
+    view: View
+
+    def time(
+        self, repeats: int, pool: TimedWorkers | None
+    ) -> tuple[tuple[float, float, float], dict[str, float]]:
+        """Median ms of forward, forward and backward together, and an iteration; and stages."""
+        both = [self._render() for _ in range(repeats + 2)][2:]  # two touch fresh memory
+        kernels = pool.stages_ms() if pool else {}
+        step, iterations = MappingIteration(self.rasterizer, self.gaussians, self.view), []
+        for _ in range(repeats + 2):
+            start = time.perf_counter()
+            step.run()
+            _synchronise(self.gaussians.means)
+            iterations.append(time.perf_counter() - start)
+        stages = {name: _median_ms(times) for name, times in step.stages.times.items()}
+        forward, whole = (_median_ms([times[i] for times in both]) for i in range(2))
+        return (forward, whole, _median_ms(iterations[2:])), {**kernels, **stages}
+
+    def _render(self) -> tuple[float, float]:
+        """Seconds of a rendering, and with its gradients."""
         start = time.perf_counter()
-        rendered = rasterizer(gaussians, view)
+        rendered = self.rasterizer(self.gaussians, self.view)
         _synchronise(rendered.colour)
-        forward.append(time.perf_counter() - start)
-        (rendered.colour.sum() + rendered.depth.sum() + rendered.alpha.sum()).backward()
+        forward = time.perf_counter() - start
+        images = rendered.colour, rendered.depth, rendered.alpha
+        slopes = [torch.ones_like(image) for image in images]
+        torch.autograd.grad(images, self.gaussians.tensors(), slopes)
         _synchronise(rendered.colour)
-        both.append(time.perf_counter() - start)
-        start = time.perf_counter()
-        step.run()
-        _synchronise(rendered.colour)
-        iteration.append(time.perf_counter() - start)
-    # The first two touch fresh memory.
-    return _median_ms(forward[2:]), _median_ms(both[2:]), _median_ms(iteration[2:])
-
-
-class _Iteration:
-    """One step towards an image that is a little darker than the present one."""
-
-    def __init__(self, rasterizer: Rasterizer, gaussians: Gaussians, view: View) -> None:
-        self._render: Callable[[], Rendered] = lambda: rasterizer(gaussians, view)
-        self._optimizer = torch.optim.Adam(gaussians.tensors(), lr=1e-7, fused=True)
-        with torch.no_grad():
-            rendered = self._render()
-        self._colour, self._depth = 0.9 * rendered.colour, rendered.depth
-        self._target = None if self._colour.is_cuda else SsimTarget.of(self._colour)
-
-    def run(self) -> None:
-        """Render, compare, differentiate, step."""
-        self._optimizer.zero_grad(set_to_none=True)
-        rendered = self._render()
-        loss = 0.8 * (rendered.colour - self._colour).abs().mean()
-        loss = loss + 0.5 * (rendered.depth - self._depth).abs().mean()
-        if self._target is not None:
-            loss = loss - 0.2 * ssim(rendered.colour, self._target)
-        loss.backward()
-        self._optimizer.step()
+        return forward, time.perf_counter() - start
 
 
 def _median_ms(seconds: list[float]) -> float:

@@ -10,7 +10,6 @@ import torch
 from services.mapping.rasterizer import (
     CpuRasterizer,
     Gaussians,
-    GsplatRasterizer,
     View,
     rasterizer_for,
     warm_up,
@@ -215,21 +214,3 @@ def test_the_device_picks_the_backend():
     assert isinstance(rasterizer_for("cpu"), CpuRasterizer)
     with pytest.raises(ConfigError, match="cpu"):
         rasterizer_for("tpu")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_cuda_without_gsplat_or_a_device_is_refused_with_what_to_do():
-    with pytest.raises(ConfigError, match="pointslam|use"):
-        rasterizer_for("cuda")
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_gsplat_equals_the_cpu():
-    expected = render_and_differentiate(CpuRasterizer(), cloud(500))
-    on_cuda = Gaussians(*(tensor.cuda() for tensor in cloud(500).tensors()))
-
-    found = render_and_differentiate(GsplatRasterizer(), on_cuda)
-
-    for tensor, twin in zip(found, expected, strict=True):
-        assert (tensor.cpu() - twin).norm() < 1e-3 * twin.norm()

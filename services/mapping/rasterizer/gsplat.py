@@ -71,7 +71,8 @@ def _camera_matrix(view: View) -> Tensor:
 
 def _screen(meta: dict[str, Any]) -> ScreenStatistics:
     """Statistics whose gradient norm a hook fills in when the backward pass reaches the means."""
-    screen = ScreenStatistics((meta["radii"][0] > 0).flatten(1).any(-1))
+    radii = meta["radii"][0]  # [N] in gsplat 1.4, [N, 2] since 1.5
+    screen = ScreenStatistics((radii.reshape(len(radii), -1) > 0).any(-1))
     half_size = torch.tensor([meta["width"], meta["height"]]) / 2.0
 
     def note(gradient: Tensor) -> None:

@@ -1,0 +1,77 @@
+"""What an iteration costs in memory and in work as scenes grow."""
+
+import numpy as np
+import pytest
+
+from benchmarks.rasterizer import room
+from services.mapping.rasterizer import CpuRasterizer, View
+from services.mapping.rasterizer.cpu import Engine
+from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.threads import workers
+from shared.camera import Intrinsics
+
+CAMERA = Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+VIEW = View(np.eye(4), CAMERA)
+
+
+class CountingScratch(Scratch):
+    """Notes how many bytes it had to ask the system for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.new_bytes = 0
+
+    def _take(self, num_bytes):
+        known = {id(memory.base) for memory in self._free}
+        memory = super()._take(num_bytes)
+        if id(memory.base) not in known:
+            self.new_bytes += memory.nbytes
+        return memory
+
+
+def iterate(rasterizer, gaussians):
+    rendered = rasterizer(gaussians, VIEW)
+    rendered.colour.sum().backward()
+    for tensor in gaussians.tensors():
+        tensor.grad = None
+
+
+def counting():
+    scratch, rasterizer = CountingScratch(), CpuRasterizer(2)
+    rasterizer._engine = Engine(workers(2), scratch)
+    return scratch, rasterizer
+
+
+@pytest.mark.parametrize("count", [20_000, 100_000])
+def test_a_pass_takes_at_most_400_bytes_per_gaussian_beside_its_images(count):
+    scratch, rasterizer = counting()
+
+    iterate(rasterizer, room(count))
+
+    images = 5 * 4 * CAMERA.width * CAMERA.height
+    assert scratch.new_bytes - 1.25 * images < 400 * count
+
+
+def test_the_next_iterations_ask_the_system_for_no_memory():
+    scratch, rasterizer = counting()
+    gaussians = room(20_000)
+    for _ in range(3):
+        iterate(rasterizer, gaussians)
+    before = scratch.new_bytes
+
+    for _ in range(5):
+        iterate(rasterizer, gaussians)
+
+    assert scratch.new_bytes == before
+
+
+def test_the_work_grows_no_faster_than_the_scene():
+    def pairs(count):
+        engine = Engine(workers(1), Scratch())
+        lists = engine.prepare(room(count), VIEW).lists
+        assert lists is not None
+        return len(lists.owners)
+
+    small, large = pairs(5_000), pairs(50_000)
+
+    assert large < 10 * small
