@@ -1,201 +1,142 @@
-"""Mapping alone, with the true poses of a sequence: quality on held-out frames, and time.
+"""Mapping alone, with the true poses of a sequence: quality against time, and the ablations.
 
-python -m benchmarks.mapping [SEQUENCE] [--frames N] [--refine N] [--json]
+pointslam bench mapping [SEQUENCE] [--frames N] [--refine N] [--variants NAME ...] [--json]
 
-Without a sequence, a procedural room is recorded into a temporary folder first.
+Each variant is one map, in a process of its own; `full` is the default settings and the others
+leave one part of the paper out (Table 5) or in. Without a sequence, a procedural room is recorded
+first. Growing begins at densification.first_iteration: shorter runs do not show it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
+import multiprocessing
 import sys
 import tempfile
-import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from pointslam.datasets import FileSequence, is_held_out, open_sequence
+from benchmarks.mapping_run import RunPlan, measure
 from pointslam.synth import SynthOptions, write_sequence
-from services.mapping.config import MappingConfig
-from services.mapping.pipeline import MapFigures, Mapper, NewKeyframe
-from services.mapping.ssim import ssim
-from services.mapping.warm_up import warm_up
-from shared.config import override, read_overrides
 from shared.errors import PointSlamError
-from shared.frames import Frame
-from shared.maps import RenderRequest
-from shared.rectify import RgbdImage, rectify
-from shared.tracks import KeyframePoses
 
-
-@dataclass(frozen=True)
-class Score:
-    """Means over views, no mask."""
-
-    psnr_db: float
-    ssim: float
-    depth_l1_m: float
-    views: int
+ABLATIONS = {
+    "full": (),
+    "plain": ("anchors.gaussians=plain",),
+    "no-compensation": (
+        "anchors.features=random",
+        "rates.exposure_gain=0",
+        "rates.exposure_bias=0",
+    ),
+    "no-growing": ("densification.grow_share=0",),
+    "no-depth-loss": ("loss.depth=0",),
+    "overlapping": ("schedule.draws=overlapping",),
+}
+READINGS = {  # of the paper's words, beside the defaults
+    "environment": ("anchors.features=environment",),
+    "colours+environment": ("anchors.features=both",),
+    "halving": ("densification.rule=halving",),
+}
+VARIANTS = ABLATIONS | READINGS
+_SYNTH_FRAMES = 60
 
 
 def arguments(argv: list[str]) -> argparse.Namespace:
     """What the command line says."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="pointslam bench mapping", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("sequence", type=Path, nargs="?")
-    parser.add_argument("--frames", type=int, default=None, help="the first N only")
+    parser.add_argument("--frames", type=int, default=120, help="the first N only; 0 for all")
     parser.add_argument("--every", type=int, default=5, help="frames between keyframes")
     parser.add_argument("--holdout", type=int, default=8)
-    parser.add_argument("--refine", type=int, default=200, help="iterations after the last frame")
+    parser.add_argument("--iterations", type=int, help="a frame")
+    parser.add_argument("--refine", type=int, default=100, help="iterations after the last frame")
+    parser.add_argument("--scores", type=int, default=1, help="parts of the refinement to score")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(ABLATIONS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser.parse_args(argv)
 
 
-def frame_of(sequence: FileSequence, index: int) -> Frame:
-    """A frame as the services pass it on."""
-    recorded = sequence.frame(index)
-    return Frame(seq=index, t_ns=recorded.t_ns, rgb=recorded.rgb, depth=recorded.depth)
+def plan_of(options: argparse.Namespace) -> RunPlan:
+    """The full variant as the command line wants it."""
+    names = ("sequence", "frames", "every", "holdout", "iterations", "refine", "scores", "seed")
+    return RunPlan(**{n: getattr(options, n) for n in names}, settings=tuple(options.set))
 
 
-def true_pose(sequence: FileSequence, index: int) -> NDArray[np.float64]:
-    """`T_world_camera` [4, 4] of a frame."""
-    pose = sequence.truth(index)
-    if pose is None:
-        raise PointSlamError(f"frame {index} of {sequence.name} has no true pose")
-    return pose
+def measure_variants(plan: RunPlan, names: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """One map after the other, each in a fresh process, so that its memory is its own."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn, max_tasks_per_child=1) as pool:
+        for name in names:
+            settings = (*VARIANTS[name], *plan.settings)
+            yield name, pool.submit(measure, replace(plan, settings=settings)).result()
 
 
-def orb_points(image: RgbdImage, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """ORB keypoints with depth, in the world, [L, 3]: what tracking would call landmarks."""
-    grey = cv2.cvtColor(image.rgb, cv2.COLOR_RGB2GRAY)
-    keypoints = cv2.ORB_create(1000).detect(grey, None)  # pyright: ignore
-    uv = np.array([keypoint.pt for keypoint in keypoints]).reshape(-1, 2)
-    z = image.depth_m[uv[:, 1].astype(int), uv[:, 0].astype(int)].astype(np.float64)
-    uv, z, k = uv[z > 0], z[z > 0], image.intrinsics
-    points = np.stack([(uv[:, 0] - k.cx) / k.fx * z, (uv[:, 1] - k.cy) / k.fy * z, z], axis=1)
-    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+def lines(name: str, result: dict[str, Any]) -> Iterator[str]:
+    """One variant for people: its costs, then a line for each score."""
+    size = result["map"]
+    yield (
+        f"{name}: {result['keyframes']} keyframes, {size['anchors']} anchors "
+        f"({size['primary']} primary), map {size['num_bytes'] / 1e6:.1f} MB, "
+        f"insertion {result['insert_keyframe_ms']:.0f} ms, "
+        f"iteration {result['iteration_ms']:.0f} ms, peak {result['peak_rss_mb']} MB"
+    )
+    for point in result["curve"]:
+        blocks = (f"{_score(point[block])}" for block in ("all", "heldout", "novel"))
+        when = f"{point['phase']:8} {point['iterations']:6} it {point['seconds']:7.1f} s"
+        yield f"  {when}  " + "   ".join(blocks)
 
 
-def run_online(mapper: Mapper, sequence: FileSequence, options: argparse.Namespace) -> float:
-    """Feed the sequence as the mapping service would be fed; returns the mapper's seconds."""
-    count = min(len(sequence), options.frames or len(sequence))
-    iterations = mapper.config.schedule.iterations_per_frame
-    keyframes: dict[int, NDArray[np.float64]] = {}
-    seconds, newest = 0.0, -options.every
-    for index in range(count):
-        start = time.perf_counter()
-        if index - newest >= options.every and not is_held_out(index, options.holdout):
-            newest, keyframes[index] = index, true_pose(sequence, index)
-            mapper.insert_keyframe(new_keyframe(sequence, index, keyframes))
-        mapper.iterate(iterations)
-        seconds += time.perf_counter() - start
-    return seconds
+def _score(block: dict[str, float | None]) -> str:
+    """PSNR / SSIM / depth L1."""
+    if block["psnr_db"] is None:
+        return f"{'-':>21}"
+    depth = "-" if block["depth_l1_m"] is None else f"{100 * block['depth_l1_m']:.2f}"
+    return f"{block['psnr_db']:5.2f} / {block['ssim']:.3f} / {depth:>5}"
 
 
-def new_keyframe(
-    sequence: FileSequence, index: int, keyframes: dict[int, NDArray[np.float64]]
-) -> NewKeyframe:
-    """The keyframe with the poses of all before it."""
-    frame = frame_of(sequence, index)
-    image = rectify(frame, sequence.calibration)
-    seqs, poses = np.array(list(keyframes), np.int64), np.stack(list(keyframes.values()))
-    landmarks = orb_points(image, keyframes[index])
-    return NewKeyframe(frame, KeyframePoses(len(seqs), seqs, poses), landmarks)
+def ablation(results: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """What each variant gains over the full map on held-out frames."""
+    ends = {name: result["curve"][-1]["heldout"] for name, result in results.items()}
+    if "full" not in ends or ends["full"]["psnr_db"] is None:
+        return
+    yield "held-out against full, after the last iteration:"
+    for name, end in ends.items():
+        gains = end["psnr_db"] - ends["full"]["psnr_db"], end["ssim"] - ends["full"]["ssim"]
+        yield f"  {name:20} {gains[0]:+6.2f} dB  SSIM {gains[1]:+.3f}"
 
 
-def run_refinement(mapper: Mapper, iterations: int) -> float:
-    """Refine; returns seconds."""
-    start = time.perf_counter()
-    for done in range(iterations):
-        mapper.refine(done / iterations)
-    return time.perf_counter() - start
-
-
-def held_out_score(mapper: Mapper, sequence: FileSequence, options: argparse.Namespace) -> Score:
-    """Render the held-out frames from their true poses."""
-    count = min(len(sequence), options.frames or len(sequence))
-    rows = []
-    for index in (i for i in range(count) if is_held_out(i, options.holdout)):
-        frame = frame_of(sequence, index)
-        image = rectify(frame, sequence.calibration)
-        request = RenderRequest(true_pose(sequence, index), image.intrinsics, frame.t_ns)
-        reply = mapper.render(request)
-        known = image.depth_m > 0
-        rows.append(
-            (
-                -10.0 * np.log10(np.mean((floats(reply.rgb) - floats(image.rgb)).numpy() ** 2)),
-                float(ssim(floats(reply.rgb), floats(image.rgb))),
-                float(np.abs(reply.depth_m - image.depth_m)[known].mean()),
-            )
-        )
-    return Score(*np.mean(rows, axis=0).tolist(), views=len(rows))
-
-
-def floats(rgb: NDArray[np.uint8]) -> torch.Tensor:
-    """Bytes as 0 to 1."""
-    return torch.from_numpy(rgb.astype(np.float32) / np.float32(255.0))
-
-
-def measure(sequence: FileSequence, options: argparse.Namespace) -> dict[str, Any]:
-    """Run both phases and score each."""
-    config = override(MappingConfig(), read_overrides(None, options.set))
-    mapper = Mapper(sequence.calibration, config, options.seed, torch.device("cpu"))
-    online_s = run_online(mapper, sequence, options)
-    result: dict[str, Any] = {
-        "sequence": sequence.name,
-        "keyframes": len(mapper.views),
-        "online_s": online_s,
-        "online": vars(held_out_score(mapper, sequence, options)),
-        "stages_ms": mapper.stages.medians(),
-    }
-    if options.refine:
-        result["refinement_s"] = run_refinement(mapper, options.refine)
-        result["refined"] = vars(held_out_score(mapper, sequence, options))
-    result["map"] = vars(MapFigures.of(mapper))
-    result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    return result
-
-
-def table(result: dict[str, Any]) -> str:
-    """The measurements for people."""
-    lines = [
-        f"{result['sequence']}: {result['keyframes']} keyframes, {result['map']['anchors']} anchors"
-    ]
-    for phase, seconds in (("online", "online_s"), ("refined", "refinement_s")):
-        if phase in result:
-            score = result[phase]
-            lines.append(
-                f"{phase:10} {score['psnr_db']:6.2f} dB  SSIM {score['ssim']:.3f}  "
-                f"depth {100 * score['depth_l1_m']:.2f} cm  {result[seconds]:7.1f} s  "
-                f"({score['views']} held-out views)"
-            )
-    stages = "  ".join(f"{name} {ms:.1f}" for name, ms in result["stages_ms"].items())
-    return "\n".join([*lines, f"median ms: {stages}", f"peak {result['peak_rss_mb']} MB"])
+def run(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Measure all variants; prints each as it ends, unless the result is to be JSON."""
+    results = {}
+    if not options.json:
+        print("PSNR dB / SSIM / depth L1 cm of all, held-out and novel views")
+    for name, result in measure_variants(plan_of(options), options.variants):
+        results[name] = result
+        if not options.json:
+            print("\n".join(lines(name, result)), flush=True)
+    return results
 
 
 def main(argv: list[str]) -> int:
     """Print the measurements."""
     options = arguments(argv)
     try:
-        warm_up()
         with tempfile.TemporaryDirectory() as folder:
             if options.sequence is None:
                 options.sequence = Path(folder) / "room"
-                write_sequence(options.sequence, SynthOptions(num_frames=80))
-            result = measure(open_sequence(options.sequence), options)
+                write_sequence(options.sequence, SynthOptions(num_frames=_SYNTH_FRAMES))
+            results = run(options)
     except PointSlamError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    print(json.dumps(result, indent=1) if options.json else table(result))
+    print(json.dumps(results, indent=1) if options.json else "\n".join(ablation(results)))
     return 0
 
 

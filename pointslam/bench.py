@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from shared.errors import ConfigError, PointSlamError
@@ -12,8 +13,8 @@ NAMES = ("rasterizer", "tracking", "mapping", "gateway")
 _FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
 
-def run_benchmark(name: str, as_json: bool) -> None:
-    """Run `benchmarks/<name>.py` in a process of its own; it prints its table or JSON.
+def run_benchmark(name: str, options: Sequence[str]) -> None:
+    """Run `benchmarks/<name>.py OPTIONS` in a process of its own; it prints its table or JSON.
 
     Raises:
         ConfigError: this is an installed package without its benchmarks.
@@ -22,7 +23,6 @@ def run_benchmark(name: str, as_json: bool) -> None:
     script = _FOLDER / f"{name}.py"
     if not script.is_file():
         raise ConfigError(f"{script} is absent: benchmarks need a checkout of the repository")
-    arguments = ["--json"] if as_json else []
-    code = subprocess.run([sys.executable, str(script), *arguments], check=False).returncode
+    code = subprocess.run([sys.executable, str(script), *options], check=False).returncode
     if code != 0:
         raise PointSlamError(f"the {name} benchmark ended with code {code}")

@@ -166,13 +166,15 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("name", choices=NAMES)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.add_argument("options", nargs=argparse.REMAINDER, help="of that benchmark; try --help")
     parser.set_defaults(command=_bench)
 
 
 def _bench(arguments: argparse.Namespace) -> None:
     from pointslam.bench import run_benchmark
 
-    run_benchmark(arguments.name, as_json=arguments.json)
+    as_json = ["--json"] if arguments.json else []
+    run_benchmark(arguments.name, [*as_json, *arguments.options])
 
 
 def _say(text: str) -> None:
