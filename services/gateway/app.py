@@ -10,6 +10,7 @@ from services.gateway.dispatch import TrackerPool
 from services.gateway.http import http_routes
 from services.gateway.map_http import map_routes
 from services.gateway.members import Members
+from services.gateway.metrics import metrics_routes
 from services.gateway.owner import Fabric
 from services.gateway.problems import add_handlers
 from services.gateway.sessions import Sessions
@@ -41,6 +42,7 @@ def create_app(sessions: Sessions) -> FastAPI:
     )
     for router in (http_routes(sessions), map_routes(sessions), websocket_routes(sessions)):
         app.include_router(router)
+    app.include_router(metrics_routes())
     add_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=sessions.fabric.config.limits.max_message_bytes)
     return app

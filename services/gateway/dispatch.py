@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from services.gateway.config import DispatchConfig
 from services.gateway.members import Members
+from services.gateway.metrics import QUARANTINES, RETRIES
 from shared.bus import Bus, Keys
 from shared.errors import GoneError, TimedOutError, UnavailableError
 from shared.frames import TrackRequest
@@ -75,10 +76,13 @@ class TrackerPool:
             try:
                 return await self._bus.ask(Keys.track(worker), request, TrackResult, limit)
             except GoneError:
+                RETRIES.labels("gone").inc()
                 LOGGER.warning("tracking worker %s is gone; frame %d", worker, request.frame.seq)
             except TimedOutError:
                 LOGGER.warning("tracking worker %s timed out after %.1f s", worker, limit)
                 self._quarantined[worker] = time.monotonic() + self._config.quarantine_s
+                RETRIES.labels("timeout").inc()
+                QUARANTINES.inc()
             failed.add(worker)
             self._seats.pop(request.session, None)
 

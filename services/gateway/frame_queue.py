@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from services.gateway.errors import OrderError
+from services.gateway.metrics import FRAME_SECONDS, FRAMES
 from shared.errors import PointSlamError, UnavailableError
 from shared.frames import TrackingStatus
 from shared.stream import FrameMessage, FrameReply
@@ -107,6 +108,7 @@ class FrameQueue:
 
     async def _outcome(self, current: _Waiting) -> Outcome:
         waited_ms = 1e3 * (time.perf_counter() - current.since_s)
+        FRAME_SECONDS.labels("queue").observe(waited_ms / 1e3)
         try:
             reply = await self._answer(current.message, waited_ms)
         except PointSlamError as error:
@@ -123,3 +125,6 @@ class FrameQueue:
 def _settle(waiting: _Waiting, outcome: Outcome) -> None:
     if not waiting.outcome.done():
         waiting.outcome.set_result(outcome)
+        is_answered = isinstance(outcome, FrameReply)
+        FRAMES.labels(str(outcome.status) if is_answered else "refused").inc()
+        FRAME_SECONDS.labels("total").observe(time.perf_counter() - waiting.since_s)

@@ -12,6 +12,7 @@ from typing import Any
 from services.gateway.config import GatewayConfig
 from services.gateway.dispatch import TrackerPool
 from services.gateway.members import Members
+from services.gateway.metrics import TAKEOVERS
 from shared.bus import Bus, Keys
 from shared.errors import (
     ConflictError,
@@ -148,6 +149,7 @@ class MapOwner:
         )
         self.mapper = opened.mapper
         self.epoch = opened.epoch
+        TAKEOVERS.inc()
         self.acknowledged_revision = opened.map_revision
         self.keyframes = opened.keyframe_poses
         if opened.last is not None:

@@ -9,9 +9,11 @@ import torch
 
 from services.mapping.config import MappingConfig
 from services.mapping.host import MapperHost, MapperSettings
+from services.mapping.metrics import SessionCollector
 from services.mapping.warm_up import warm_up
 from shared.bus import open_bus
 from shared.errors import ConfigError
+from shared.metrics import add_metrics_arguments, serve_metrics
 from shared.service import (
     announce_ready,
     endpoints,
@@ -40,6 +42,7 @@ def main(argv: list[str]) -> None:
     """Read settings, warm up, connect, serve until told to stop."""
     parser = service_arguments(__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder for the sessions")
+    add_metrics_arguments(parser)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     arguments = parser.parse_args(argv)
     stop = stop_event()
@@ -51,9 +54,11 @@ def main(argv: list[str]) -> None:
         config=settings_from(arguments, MappingConfig()),
         device=device_named(arguments.device),
     )
+    serve_metrics(arguments)
     warm_up()
     with open_bus(endpoints(arguments)) as bus:
         host = MapperHost(bus, settings)
+        SessionCollector(host.infos)
         host.start()
         announce_ready(arguments.id)
         stop.wait()

@@ -38,6 +38,7 @@ from shared.maps import (
     DeleteRequest,
     Empty,
     ExportRequest,
+    MapInfo,
     RefineRequest,
     RenderRequest,
     SaveRequest,
@@ -140,6 +141,12 @@ class MapperHost:
             folders = sorted(p for p in self._settings.data.iterdir() if has_session(p))
             summaries = [self._summary(folder) for folder in folders]
         return SessionList(tuple(s for s in summaries if s is not None))
+
+    def infos(self) -> list[MapInfo]:
+        """The state of every open session's map."""
+        with self._lock:
+            served = list(self._served.values())
+        return [each.session.info() for each in served]
 
     def delete(self, request: DeleteRequest) -> Empty:
         """Close a session and remove every byte of it.

@@ -11,6 +11,7 @@ from services.mapping.entries import check_entry
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
 from services.mapping.log import SessionLog, read_log
 from services.mapping.map_state import MapState
+from services.mapping.metrics import LOG_SECONDS
 from services.mapping.pipeline import NewKeyframe
 from services.mapping.snapshot import read_newest
 from services.mapping.storage import SessionFolder, SessionRecord
@@ -121,7 +122,8 @@ class Ledger:
         with self._lock:
             if self._last is not None and entry.record.seq <= self._last.seq:
                 raise ConflictError(f"frame {entry.record.seq} is not newer than {self._last.seq}")
-            self._log.append(entry)
+            with LOG_SECONDS.time():
+                self._log.append(entry)
             return self._apply(entry)
 
     def _apply(self, entry: Advance) -> NewKeyframe | None:

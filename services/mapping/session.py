@@ -15,6 +15,7 @@ from services.mapping.config import MappingConfig
 from services.mapping.export import chunks, export_ply, pack_folder
 from services.mapping.ledger import Ledger, Resumed
 from services.mapping.mesh import export_mesh
+from services.mapping.metrics import SNAPSHOT_SECONDS
 from services.mapping.pipeline import MapFigures, Mapper
 from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
@@ -174,7 +175,8 @@ class Session:
                 revision = self.ledger.revision
                 state = self._worker.visit(lambda mapper: mapper.state())
             snapshot = Snapshot(capture.entries, state, capture.keyframes)
-            size = write_snapshot(self._folder.path, snapshot, self._lease.check)
+            with SNAPSHOT_SECONDS.time():
+                size = write_snapshot(self._folder.path, snapshot, self._lease.check)
             self._saved = capture.entries, state.values["iterations"]
         return SaveReply(revision, size)
 

@@ -20,6 +20,7 @@ from services.tracking.warm_up import warm_up  # noqa: E402
 from services.tracking.worker import Worker  # noqa: E402
 from shared.bus import Keys, open_bus  # noqa: E402
 from shared.frames import TrackRequest  # noqa: E402
+from shared.metrics import add_metrics_arguments, serve_metrics  # noqa: E402
 from shared.service import (  # noqa: E402
     announce_ready,
     endpoints,
@@ -37,11 +38,14 @@ def main(argv: list[str]) -> None:
     Raises:
         PointSlamError: a setting is wrong or no router answers.
     """
-    arguments = service_arguments(__doc__).parse_args(argv)
+    parser = service_arguments(__doc__)
+    add_metrics_arguments(parser)
+    arguments = parser.parse_args(argv)
     setup_logging(arguments.json_log)
     config = settings_from(arguments, TrackingConfig())
     stop = stop_event()
     cv2.setNumThreads(1)  # frames of several sessions are what runs side by side
+    serve_metrics(arguments)
     warm_up(config)
     with (
         open_bus(endpoints(arguments)) as bus,

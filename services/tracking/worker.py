@@ -7,6 +7,7 @@ from collections import OrderedDict
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
+from services.tracking import metrics
 from services.tracking.config import TrackingConfig
 from services.tracking.local_map import LocalMap, derive
 from services.tracking.pipeline import track
@@ -115,4 +116,6 @@ class Worker:
         request.calibration.check()
         source = BusSource(self._bus, request, self._cache, self._config)
         source.fetch_ahead(request.prior.reference_seq if request.prior else -1, self._fetching)
-        return track(request, source, self._config, self._helpers)
+        result = track(request, source, self._config, self._helpers)
+        metrics.count(result)
+        return result
