@@ -94,6 +94,10 @@ class StoreSource:
             self._key, self._local = key, derive(context, self._config.registration)
         return self._local
 
+    def loop_map(self, seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+        return derive(self._store.loop_context(seq), self._config.registration)
+
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """Keyframes that look like a frame."""
         return self._store.candidates(request)
@@ -161,7 +165,7 @@ def next_prior(prior: Prior | None, result: TrackResult, store: KeyframeStore) -
         seq=result.seq,
         t_ns=result.t_ns,
         T_world_camera=T,
-        T_before_last=inverse(prior.T_world_camera) @ T if prior else np.eye(4),
+        T_before_last=np.eye(4) if result.T_last_camera is None else result.T_last_camera,
         before_last_dt_ns=result.t_ns - prior.t_ns if prior else 0,
         reference_seq=result.reference_seq,
         newest_keyframe_seq=store.seqs()[-1],

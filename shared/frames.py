@@ -99,6 +99,7 @@ class Prior:
     frames_since_keyframe: int
     T_odom_camera: Pose | None = None
     frame_digest: int | None = None  # of that frame
+    T_reference_camera: NDArray[np.float64] | None = None  # [4, 4], holds when the map moves
 
 
 @dataclass(frozen=True)

@@ -109,6 +109,7 @@ class MapInfo:
     refinement_s: float
     map_bytes: int  # anchors and networks, without optimizer state
     device: str
+    loops: int = 0  # places seen again and joined
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,8 @@ class TrackingContext:
     landmarks: Landmarks
     window: tuple[WindowKeyframe, ...]
     num_keyframes: int
+    # Keyframes that may show the reference's place and are not near in the graph, likeliest first.
+    loop_seqs: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [C]
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,25 @@ class Correction:
 
 
 @dataclass(frozen=True)
+class KeyframeLink:
+    """How a keyframe hangs on the map that it was tracked in."""
+
+    reference_seq: int  # the keyframe whose neighbourhood that was
+    map_revision: int
+    information: NDArray[np.float64]  # [6, 6], of a twist on the right of its pose
+
+
+@dataclass(frozen=True)
+class LoopConstraint:
+    """A place seen again: a keyframe's pose in the map around an earlier one."""
+
+    earlier_seq: int
+    T_earlier_keyframe: NDArray[np.float64]  # [4, 4]
+    information: NDArray[np.float64]  # [6, 6], of a twist on the right of it
+    landmark_ids: NDArray[np.int64]  # [P, 2], one point's landmark there and in the keyframe
+
+
+@dataclass(frozen=True)
 class KeyframeData:
     """What a frame brings to the map when it becomes a keyframe."""
 
@@ -100,6 +121,8 @@ class KeyframeData:
     thumbnail: NDArray[np.uint8]  # [15, 20], grey, for place recognition
     correction: Correction  # by the local bundle adjustment; new landmarks are in it too
     edge_blur_px: float = 0.0  # standard deviation of the blur of its edges, 0 where unknown
+    link: KeyframeLink | None = None  # None: the first keyframe, or one of an older log
+    loop: LoopConstraint | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +141,8 @@ class TrackResult:
     map_revision: int
     timings_ms: dict[str, float] = field(default_factory=dict)
     keyframe: KeyframeData | None = None
+    # [4, 4], motion since the prior's frame; both poses in the map of this revision
+    T_last_camera: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +181,7 @@ class ContextRequest:
 
     revision: int
     reference_seq: int
+    is_near_only: bool = False  # only what is near in the graph, which drift cannot have displaced
 
 
 @dataclass(frozen=True)

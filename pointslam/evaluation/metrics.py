@@ -78,6 +78,7 @@ def map_entries(info: dict[str, Any]) -> dict[str, Any]:
     """What the map's owner says of itself."""
     return {
         "keyframes": info["keyframes"],
+        "loops": info["loops"],
         "mapping_ms_per_iteration": {"median": info["iteration_ms"], "stages": info["stages_ms"]},
         "mapping_iterations": info["iterations"],
         "anchors": {

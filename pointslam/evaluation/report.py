@@ -43,6 +43,7 @@ def table_rows(metrics: dict[str, Any]) -> list[Row]:
         Row("sequence", f"{metrics['sequence']} ({metrics['mode']})"),
         Row("frames tracked", f"{counts}, {metrics['relocalized']} relocalized"),
         Row("keyframes", _text(metrics["keyframes"], "{:d}")),
+        Row("loops closed", _text(metrics.get("loops"), "{:d}")),
         Row("ATE online / final", _pair(metrics, "ate_online_rmse_m", "ate_final_rmse_m")),
         Row("RPE over 30 frames", _relative(metrics)),
     ]

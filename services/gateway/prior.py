@@ -20,18 +20,14 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
             lost_frames=prior.lost_frames + 1,
             frames_since_keyframe=prior.frames_since_keyframe + 1,
         )
-    motion = np.eye(4)
-    dt_ns = 0
-    if prior is not None:
-        motion = se3.inverse(prior.T_world_camera) @ result.T_world_camera
-        dt_ns = result.t_ns - prior.t_ns
+    dt_ns = 0 if prior is None else result.t_ns - prior.t_ns
     newest = prior.newest_keyframe_seq if prior else result.reference_seq
     since = prior.frames_since_keyframe + 1 if prior else 0
     return Prior(
         seq=result.seq,
         t_ns=result.t_ns,
         T_world_camera=result.T_world_camera,
-        T_before_last=motion,
+        T_before_last=_motion(prior, result),
         before_last_dt_ns=dt_ns,
         reference_seq=result.reference_seq,
         newest_keyframe_seq=result.seq if is_keyframe else newest,
@@ -39,7 +35,17 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
         frames_since_keyframe=0 if is_keyframe else since,
         T_odom_camera=frame.T_odom_camera,
         frame_digest=frame.digest(),
+        T_reference_camera=result.T_reference_camera,
     )
+
+
+def _motion(prior: Prior | None, result: TrackResult) -> np.ndarray:
+    """Since the prior's frame, [4, 4]; the map may have moved between the two answers."""
+    if result.T_last_camera is not None:
+        return result.T_last_camera
+    if prior is None:
+        return np.eye(4)
+    return se3.inverse(prior.T_world_camera) @ result.T_world_camera
 
 
 def resumed_prior(opened: OpenReply) -> Prior | None:
@@ -58,4 +64,5 @@ def resumed_prior(opened: OpenReply) -> Prior | None:
         newest_keyframe_seq=newest,
         lost_frames=0 if last.status in HAS_POSE else 1,
         frames_since_keyframe=max(0, last.seq - newest),
+        T_reference_camera=last.T_reference_camera if last.status in HAS_POSE else None,
     )

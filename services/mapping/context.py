@@ -48,20 +48,24 @@ class ContextConfig:
 
 @dataclass(frozen=True)
 class ViewCone:
-    """What a keyframe can see, from its cloud: bounds of x/z and y/z, and the farthest depth."""
+    """What a keyframe can see, from its cloud: bounds of x/z and y/z, and depths."""
 
     low: NDArray[np.float64]  # [2]
     high: NDArray[np.float64]  # [2]
     far_m: float
+    median_m: float
 
     @staticmethod
     def of(cloud_camera: PointCloud) -> ViewCone:
         """The cone of a cloud; of an empty cloud, a cone that sees nothing."""
         points = cloud_camera.points.astype(np.float64)
         if len(points) == 0:
-            return ViewCone(np.zeros(2), np.zeros(2), 0.0)
+            return ViewCone(np.zeros(2), np.zeros(2), 0.0, 1.0)
         slopes = points[:, :2] / points[:, 2:]
-        return ViewCone(slopes.min(axis=0), slopes.max(axis=0), float(points[:, 2].max()))
+        depths = points[:, 2]
+        return ViewCone(
+            slopes.min(axis=0), slopes.max(axis=0), float(depths.max()), float(np.median(depths))
+        )
 
 
 @dataclass(frozen=True)
@@ -107,25 +111,32 @@ def empty_context(revision: int) -> TrackingContext:
     )
 
 
+@dataclass(frozen=True)
+class Neighbourhood:
+    """A keyframe among those that a context may be built of."""
+
+    reference: StoredKeyframe
+    near: list[StoredKeyframe]  # itself and all that may take part, by seq
+    first_seq: int  # the first keyframe of the map
+    num_keyframes: int  # of the map
+    loop_seqs: list[int]
+
+
 def build_context(
-    keyframes: dict[int, StoredKeyframe],
-    table: LandmarkTable,
-    reference_seq: int,
-    revision: int,
-    config: ContextConfig,
+    around: Neighbourhood, table: LandmarkTable, revision: int, config: ContextConfig
 ) -> TrackingContext:
-    """The context of one keyframe; the keyframes are in order of their seq."""
-    reference = keyframes[reference_seq]
-    near = overlapping(reference, list(keyframes.values()), config)
+    """The context of one keyframe."""
+    near = overlapping(around.reference, around.near, config)
     ids = _context_landmark_ids(near, table, config)
     return TrackingContext(
         revision=revision,
-        reference_seq=reference_seq,
-        T_world_reference=reference.T_world_camera,
+        reference_seq=around.reference.seq,
+        T_world_reference=around.reference.T_world_camera,
         cloud_world=_merged_cloud(near, config),
         landmarks=landmarks_seen(table, near, ids),
-        window=_window(near, ids, next(iter(keyframes)), config),
-        num_keyframes=len(keyframes),
+        window=_window(near, ids, around.first_seq, config),
+        num_keyframes=around.num_keyframes,
+        loop_seqs=np.array(around.loop_seqs, np.int64),
     )
 
 
@@ -137,14 +148,14 @@ def overlapping(
     step = max(1, len(cloud.points) // config.overlap_samples)
     points = transform(reference.T_world_camera, cloud.points[::step].astype(np.float64))
     normals = rotate(reference.T_world_camera, cloud.normals[::step].astype(np.float64))
-    shares = _visible_shares(points, normals, keyframes)
+    shares = visible_shares(points, normals, keyframes)
     order = np.argsort(-shares, kind="stable")
     chosen = [keyframes[i] for i in order if shares[i] >= config.min_overlap]
     others = [keyframe for keyframe in chosen if keyframe.seq != reference.seq]
     return [reference, *others[: config.max_keyframes - 1]]
 
 
-def _visible_shares(
+def visible_shares(
     points_world: NDArray, normals_world: NDArray, keyframes: list[StoredKeyframe]
 ) -> NDArray[np.float64]:
     """Share of the points that lie in each keyframe's cone and face it, [K]."""

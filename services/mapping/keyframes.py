@@ -11,12 +11,24 @@ from numpy.typing import NDArray
 from services.mapping.context import (
     ContextConfig,
     LandmarkTable,
+    Neighbourhood,
     StoredKeyframe,
     ViewCone,
     build_context,
     empty_context,
     landmarks_seen,
 )
+from services.mapping.keyframe_arrays import (
+    keyframe_arrays,
+    keyframes_of,
+    landmark_arrays,
+    landmarks_of,
+)
+from services.mapping.landmarks import corrected, moved, renamed, without
+from services.mapping.loop_candidates import loop_candidates
+from services.mapping.loop_closing import LoopCloser
+from services.mapping.loop_config import LoopConfig
+from services.mapping.loops import Poses, SeenLoop
 from services.mapping.retrieval import RetrievalConfig, rank_keyframes
 from shared.errors import ConflictError, NotFoundError
 from shared.se3 import rotate
@@ -27,8 +39,7 @@ from shared.tracks import (
     Correction,
     KeyframeData,
     KeyframePoses,
-    Observations,
-    PointCloud,
+    LoopConstraint,
     TrackingContext,
 )
 
@@ -39,6 +50,7 @@ class KeyframeConfig:
 
     context: ContextConfig = field(default_factory=ContextConfig)
     retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
 
 
 class KeyframeStore:
@@ -49,6 +61,7 @@ class KeyframeStore:
         self._config = config or KeyframeConfig()
         self._keyframes: dict[int, StoredKeyframe] = {}
         self._landmarks = LandmarkTable()
+        self._loops = LoopCloser(self._config.loop)
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -56,13 +69,15 @@ class KeyframeStore:
     def insert(
         self, seq: int, t_ns: int, T_world_camera: NDArray[np.float64], data: KeyframeData
     ) -> None:
-        """Add a keyframe and apply its correction; the revision grows by one.
+        """Add a keyframe, apply its correction, close its loop; the revision grows by one.
 
         Raises:
             ConflictError: the seq is not above that of every keyframe here.
         """
         if self._keyframes and seq <= max(self._keyframes):
             raise ConflictError(f"keyframe {seq} is not newer than {max(self._keyframes)}")
+        self.revision += 1
+        T_world_camera, data = self._loops.brought_up(T_world_camera, data)
         self._keyframes[seq] = StoredKeyframe(
             seq=seq,
             t_ns=t_ns,
@@ -73,18 +88,38 @@ class KeyframeStore:
             cone=ViewCone.of(data.cloud_camera),
             edge_blur_px=data.edge_blur_px,
         )
-        self._move_keyframes(data.correction)
-        self._landmarks = _corrected(
-            self._landmarks, data, rotate(self.pose(seq), data.landmark_normals_camera)
-        )
-        self.revision += 1
+        self._move_keyframes(_by_seq(data.correction))
+        normals_world = rotate(self.pose(seq), data.landmark_normals_camera)
+        self._landmarks = corrected(self._landmarks, data, normals_world)
+        poses = self._poses()
+        self._loops.graph.follow(data.correction.keyframe_seqs.tolist(), poses)
+        self._loops.link(self._keyframes[seq], data.link, poses)
+        if data.loop is not None:
+            self._close_loop(seq, data.loop)
 
-    def _move_keyframes(self, correction: Correction) -> None:
-        poses = zip(correction.keyframe_seqs, correction.T_world_keyframes, strict=True)
-        for seq, T_world_camera in poses:
-            if int(seq) in self._keyframes:
-                moved = replace(self._keyframes[int(seq)], T_world_camera=T_world_camera)
-                self._keyframes[int(seq)] = moved
+    def _close_loop(self, seq: int, constraint: LoopConstraint) -> None:
+        """Bend the graph where the constraint is believed; one place has its landmarks once."""
+        if constraint.earlier_seq not in self._keyframes:
+            return
+        seen = SeenLoop(seq, self._keyframe(seq).cone.median_m, constraint)
+        closing = self._loops.close(seen, self._poses(), self.revision)
+        if closing is None:
+            return
+        self._move_keyframes(closing.T_world_keyframes)
+        self._landmarks = moved(self._landmarks, closing.T_new_old)
+        self._landmarks = without(self._landmarks, closing.landmark_ids[:, 1])
+        for keyframe in list(self._keyframes.values()):
+            observations = renamed(keyframe.observations, closing.landmark_ids)
+            self._keyframes[keyframe.seq] = replace(keyframe, observations=observations)
+
+    def _move_keyframes(self, T_world_keyframes: Poses) -> None:
+        for seq, T_world_camera in T_world_keyframes.items():
+            if seq in self._keyframes:
+                moved = replace(self._keyframes[seq], T_world_camera=T_world_camera)
+                self._keyframes[seq] = moved
+
+    def _poses(self) -> dict[int, NDArray[np.float64]]:
+        return {seq: keyframe.T_world_camera for seq, keyframe in self._keyframes.items()}
 
     def pose(self, seq: int) -> NDArray[np.float64]:
         """Present pose of a keyframe, [4, 4].
@@ -116,6 +151,11 @@ class KeyframeStore:
         ids = self._known_ids(self._keyframe(seq))
         return ids, self._landmarks.positions_world[self._landmarks.rows(ids)]
 
+    @property
+    def num_loops(self) -> int:
+        """Places that were seen again and joined."""
+        return self._loops.graph.num_loops
+
     def num_landmarks(self) -> int:
         """Number of landmarks of the map."""
         return len(self._landmarks.ids)
@@ -128,9 +168,42 @@ class KeyframeStore:
         if not self._keyframes:
             return empty_context(self.revision)
         known = reference_seq if reference_seq in self._keyframes else max(self._keyframes)
-        return build_context(
-            self._keyframes, self._landmarks, known, self.revision, self._config.context
+        loop_seqs = self._loop_candidates(known)
+        return self._context(known, list(self._keyframes.values()), loop_seqs)
+
+    def loop_context(self, seq: int) -> TrackingContext:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only.
+
+        Raises:
+            NotFoundError: no such keyframe.
+        """
+        self._keyframe(seq)
+        return self._context(seq, self._near_and_far(seq)[0], [])
+
+    def _context(
+        self, reference_seq: int, near: list[StoredKeyframe], loop_seqs: list[int]
+    ) -> TrackingContext:
+        around = Neighbourhood(
+            reference=self._keyframes[reference_seq],
+            near=near,
+            first_seq=next(iter(self._keyframes)),
+            num_keyframes=len(self._keyframes),
+            loop_seqs=loop_seqs,
         )
+        return build_context(around, self._landmarks, self.revision, self._config.context)
+
+    def _loop_candidates(self, reference_seq: int) -> list[int]:
+        config = self._config.loop
+        if not config.is_enabled:
+            return []
+        _, far = self._near_and_far(reference_seq)
+        return loop_candidates(self._keyframes[reference_seq], far, config.candidates)
+
+    def _near_and_far(self, seq: int) -> tuple[list[StoredKeyframe], list[StoredKeyframe]]:
+        near_seqs = self._loops.near(seq)
+        keyframes = self._keyframes.values()
+        near = [keyframe for keyframe in keyframes if keyframe.seq in near_seqs]
+        return near, [keyframe for keyframe in keyframes if keyframe.seq not in near_seqs]
 
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """The keyframes that look most like a frame, with the landmarks they saw."""
@@ -161,30 +234,11 @@ class KeyframeStore:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a snapshot."""
-        keyframes = list(self._keyframes.values())
-        poses = self.poses()
         return {
             "revision": np.array([self.revision], np.int64),
-            "seqs": poses.seqs,
-            "t_ns": np.array([k.t_ns for k in keyframes], np.int64),
-            "T_world_keyframes": poses.T_world_keyframes,
-            "edge_blurs_px": np.array([k.edge_blur_px for k in keyframes], np.float64),
-            "thumbnails": _joined([k.thumbnail[None] for k in keyframes], (0, 15, 20), np.uint8),
-            "num_points": np.array([len(k.cloud_camera.points) for k in keyframes], np.int64),
-            "points": _joined([k.cloud_camera.points for k in keyframes], (0, 3), np.float32),
-            "normals": _joined([k.cloud_camera.normals for k in keyframes], (0, 3), np.float32),
-            "num_features": np.array(
-                [len(k.observations.landmark_ids) for k in keyframes], np.int64
-            ),
-            **{
-                f"observations.{name}": _joined(
-                    [getattr(k.observations, name) for k in keyframes], shape, dtype
-                )
-                for name, shape, dtype in _OBSERVATION_ARRAYS
-            },
-            "landmarks.ids": self._landmarks.ids,
-            "landmarks.positions_world": self._landmarks.positions_world,
-            "landmarks.normals_world": self._landmarks.normals_world,
+            **keyframe_arrays(list(self._keyframes.values())),
+            **landmark_arrays(self._landmarks),
+            **self._loops.state(),
         }
 
     @classmethod
@@ -194,74 +248,14 @@ class KeyframeStore:
         """The store that `state` came from."""
         store = cls(config)
         store.revision = int(state["revision"][0])
-        store._landmarks = LandmarkTable(
-            state["landmarks.ids"],
-            state["landmarks.positions_world"],
-            state["landmarks.normals_world"],
-        )
-        points_end = np.cumsum(state["num_points"])
-        features_end = np.cumsum(state["num_features"])
-        for i, seq in enumerate(state["seqs"].tolist()):
-            points = slice(int(points_end[i] - state["num_points"][i]), int(points_end[i]))
-            features = slice(int(features_end[i] - state["num_features"][i]), int(features_end[i]))
-            store._keyframes[seq] = _stored(state, i, points, features)
+        store._landmarks = landmarks_of(state)
+        store._keyframes = keyframes_of(state)
+        if "graph.pairs" in state:  # else it is of a version without loops
+            store._loops.restore(state)
+        else:
+            store._loops.link_all(store._keyframes)
         return store
 
 
-_OBSERVATION_ARRAYS: tuple[tuple[str, tuple[int, ...], type], ...] = (
-    ("landmark_ids", (0,), np.int64),
-    ("keypoints_px", (0, 2), np.float32),
-    ("octaves", (0,), np.uint8),
-    ("depths_m", (0,), np.float32),
-    ("descriptors", (0, 32), np.uint8),
-)
-
-
-def _joined(parts: list[np.ndarray], empty_shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    return np.concatenate([np.zeros(empty_shape, dtype), *parts])
-
-
-def _stored(
-    state: Mapping[str, np.ndarray], index: int, points: slice, features: slice
-) -> StoredKeyframe:
-    cloud = PointCloud(state["points"][points], state["normals"][points])
-    observations = {
-        name: state[f"observations.{name}"][features] for name, _, _ in _OBSERVATION_ARRAYS
-    }
-    return StoredKeyframe(
-        seq=int(state["seqs"][index]),
-        t_ns=int(state["t_ns"][index]),
-        T_world_camera=state["T_world_keyframes"][index],
-        observations=Observations(**observations),
-        cloud_camera=cloud,
-        thumbnail=state["thumbnails"][index],
-        cone=ViewCone.of(cloud),
-        edge_blur_px=float(state["edge_blurs_px"][index]) if "edge_blurs_px" in state else 0.0,
-    )
-
-
-def _corrected(
-    table: LandmarkTable, data: KeyframeData, normals_world: NDArray[np.float32]
-) -> LandmarkTable:
-    """The table with the correction's positions; ids that it lacks are added with their normals."""
-    correction = data.correction
-    rows = table.rows(correction.landmark_ids)
-    is_new = rows < 0
-    positions = table.positions_world.copy()
-    positions[rows[~is_new]] = correction.positions_world[~is_new]
-    new_ids, first = np.unique(correction.landmark_ids[is_new], return_index=True)
-    normals = np.zeros((len(new_ids), 3), np.float32)
-    if len(new_ids):
-        observed = data.observations.landmark_ids
-        at = np.minimum(np.searchsorted(new_ids, observed), len(new_ids) - 1)
-        mine = np.flatnonzero(new_ids[at] == observed)
-        normals[at[mine]] = normals_world[mine]
-    ids = np.concatenate([table.ids, new_ids])
-    order = np.argsort(ids, kind="stable")
-    return LandmarkTable(
-        ids=ids[order],
-        positions_world=np.concatenate([positions, correction.positions_world[is_new][first]])[
-            order
-        ],
-        normals_world=np.concatenate([table.normals_world, normals])[order],
-    )
+def _by_seq(correction: Correction) -> dict[int, NDArray[np.float64]]:
+    return dict(zip(correction.keyframe_seqs.tolist(), correction.T_world_keyframes, strict=True))

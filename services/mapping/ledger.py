@@ -102,6 +102,11 @@ class Ledger:
         return self._store.num_landmarks()
 
     @property
+    def num_loops(self) -> int:
+        """Places that were seen again and joined."""
+        return self._store.num_loops
+
+    @property
     def num_keyframes(self) -> int:
         """Keyframes of the map."""
         return len(self._store)
@@ -147,6 +152,8 @@ class Ledger:
     def context(self, request: ContextRequest) -> TrackingContext:
         """The neighbourhood of a keyframe."""
         with self._lock:
+            if request.is_near_only:
+                return self._store.loop_context(request.reference_seq)
             return self._store.context(request.reference_seq)
 
     def candidates(self, request: CandidatesRequest) -> Candidates:

@@ -44,18 +44,22 @@ def rank_keyframes(
     """
     likeness = thumbnail_correlation(thumbnail, np.stack([k.thumbnail for k in keyframes]))
     order = np.argsort(-likeness, kind="stable")[: config.max_compared]
-    query = _packed(descriptors, config.max_descriptors)
+    limits = config.max_descriptors, config.max_hamming_bits
     votes = np.array(
-        [
-            _count_near(
-                query,
-                _packed(keyframes[i].observations.descriptors, config.max_descriptors),
-                config.max_hamming_bits,
-            )
-            for i in order
-        ]
+        [count_alike(descriptors, keyframes[i].observations.descriptors, *limits) for i in order]
     )
     return [keyframes[i] for i in order[np.argsort(-votes, kind="stable")]]
+
+
+def count_alike(
+    descriptors: NDArray[np.uint8],
+    others: NDArray[np.uint8],
+    max_descriptors: int,
+    max_hamming_bits: int,
+) -> int:
+    """How many ORB descriptors [M, 32] have a near one among others [N, 32]."""
+    query, stored = _packed(descriptors, max_descriptors), _packed(others, max_descriptors)
+    return int(_count_near(query, stored, max_hamming_bits))
 
 
 def thumbnail_correlation(

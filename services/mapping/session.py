@@ -194,6 +194,7 @@ class Session:
             frames=ledger.entries,
             keyframes=ledger.num_keyframes,
             landmarks=ledger.num_landmarks,
+            loops=ledger.num_loops,
             pending=self._worker.pending,
             refinement=self._worker.job,
             stages_ms=stages,

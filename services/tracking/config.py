@@ -134,6 +134,24 @@ class RelocalizationConfig:
 
 
 @dataclass(frozen=True)
+class LoopVerificationConfig:
+    """When a keyframe is believed to show the place of an earlier one."""
+
+    max_candidates: int = 2
+    min_inliers: int = 40
+    min_inlier_share: float = 0.4
+    min_agreement: float = 0.85
+    min_overlap: float = 0.3
+    unmoved_min_agreement: float = 0.95  # without features
+    unmoved_min_overlap: float = 0.4
+    unmoved_m: float = 0.02  # from the pose as tracked
+    unmoved_deg: float = 0.6
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "max_candidates", "min_inliers", "unmoved_m", "unmoved_deg")
+
+
+@dataclass(frozen=True)
 class KeyframeRuleConfig:
     """When a frame becomes a keyframe."""
 
@@ -181,6 +199,7 @@ class TrackingConfig:
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    loop: LoopVerificationConfig = field(default_factory=LoopVerificationConfig)
     keyframe: KeyframeRuleConfig = field(default_factory=KeyframeRuleConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     context_cache: int = 8  # contexts kept, over all sessions

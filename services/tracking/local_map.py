@@ -25,6 +25,10 @@ class MapSource(Protocol):
         """The neighbourhood of a keyframe; of the newest one for -1."""
         ...
 
+    def loop_map(self, seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+        ...
+
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """Keyframes that look like a frame."""
         ...

@@ -7,6 +7,7 @@ whichever worker gets the frame gives the same result to the bit.
 from __future__ import annotations
 
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,16 @@ from services.tracking.keyframes import (
     sharpness_of,
 )
 from services.tracking.local_map import LocalMap, MapSource
+from services.tracking.loop_verification import find_loop
 from services.tracking.observed import Observed, observe
+from services.tracking.prediction import brought_up
 from services.tracking.search import Found, Job, search
 from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
 from shared.frames import TrackingStatus, TrackRequest
 from shared.se3 import inverse
-from shared.tracks import NO_LANDMARK, KeyframeData, TrackResult
+from shared.tracks import NO_LANDMARK, KeyframeData, KeyframeLink, TrackResult
 
 _ALONE = NoHelper()
 
@@ -62,12 +65,21 @@ def track(
         local = source.local_map(request.prior.reference_seq if request.prior else -1)
     if local.context.num_keyframes == 0:
         return _begin(job)
+    job = _brought_up(job, local)
     found = search(job, local)
     if found.estimate is None:
         return _lost(job, local)
     with clock.stage("keyframe"):
         keyframe = _new_keyframe(job, found)
     return _answer(job, found, keyframe)
+
+
+def _brought_up(job: Job, local: LocalMap) -> Job:
+    """The job with its prior in the map as it is now."""
+    if job.request.prior is None:
+        return job
+    prior = brought_up(job.request.prior, local.context)
+    return replace(job, request=replace(job.request, prior=prior))
 
 
 def _begin(job: Job) -> TrackResult:
@@ -151,7 +163,12 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
         correction = adjust_window(new, estimate.local.context, observed.intrinsics, config)
     blur_px = sharpness.edge_blur_px
     parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
-    return keyframe_data(parts, config.surface, config.keyframe)
+    context = estimate.local.context
+    link = KeyframeLink(context.reference_seq, context.revision, estimate.information)
+    with job.clock.stage("loop"):
+        loop = find_loop(job, estimate, observations)
+    data = keyframe_data(parts, config.surface, config.keyframe)
+    return replace(data, link=link, loop=loop)
 
 
 def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
@@ -193,7 +210,13 @@ def _answer(job: Job, found: Found, keyframe: KeyframeData | None) -> TrackResul
         map_revision=estimate.local.context.revision,
         timings_ms=job.clock.times(),
         keyframe=keyframe,
+        T_last_camera=_motion(job, T),
     )
+
+
+def _motion(job: Job, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    prior = job.request.prior
+    return None if prior is None else inverse(prior.T_world_camera) @ T_world_camera
 
 
 def _reference(job: Job, estimate: Estimate) -> tuple[int, NDArray[np.float64]]:

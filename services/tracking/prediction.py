@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.frames import Frame, Prior
 from shared.se3 import exp, inverse, log
+from shared.tracks import TrackingContext
 
 _MAX_EXTRAPOLATION = 3.0
+
+
+def brought_up(prior: Prior, context: TrackingContext) -> Prior:
+    """The prior in the map as it is now: its pose goes along with its reference keyframe."""
+    if prior.T_reference_camera is None or prior.reference_seq != context.reference_seq:
+        return prior
+    T_world_camera = context.T_world_reference @ prior.T_reference_camera
+    return replace(prior, T_world_camera=T_world_camera)
 
 
 def predict(prior: Prior, frame: Frame) -> NDArray[np.float64]:

@@ -63,6 +63,10 @@ class _OneKeyframe:
         """The only one."""
         return self._local
 
+    def loop_map(self, seq: int) -> LocalMap:
+        """The only one."""
+        return self._local
+
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """The only keyframe."""
         return Candidates(0, (Candidate(0, np.eye(4), self._local.context.landmarks),))

@@ -22,7 +22,7 @@ from shared.tracks import (
 )
 
 _FETCHES = 4  # contexts asked for at the same time
-ContextKey = tuple[str, int, int, int]  # session, epoch, revision, reference_seq
+ContextKey = tuple[str, int, int, int, bool]  # session, epoch, revision, reference_seq, near only
 
 
 class ContextCache:
@@ -74,17 +74,20 @@ class BusSource:
             return self._ahead[reference_seq].result()
         return self._local_map(reference_seq)
 
-    def _local_map(self, reference_seq: int) -> LocalMap:
-        request = self._request
-        asked = (request.session, request.epoch, request.map_revision, reference_seq)
-        local = self._cache.get(asked)
+    def loop_map(self, seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+        return self._local_map(seq, is_near_only=True)
+
+    def _local_map(self, reference_seq: int, is_near_only: bool = False) -> LocalMap:
+        session, epoch = self._request.session, self._request.epoch
+        asked = ContextRequest(self._request.map_revision, reference_seq, is_near_only)
+        local = self._cache.get((session, epoch, asked.revision, reference_seq, is_near_only))
         if local is None:
-            context: TrackingContext = self._ask(
-                "context", ContextRequest(request.map_revision, reference_seq), TrackingContext
-            )
+            context: TrackingContext = self._ask("context", asked, TrackingContext)
             local = derive(context, self._config.registration)
             # A live map may have moved on: then this is the answer for its revision only.
-            self._cache.put((*asked[:2], context.revision, reference_seq), local)
+            key = (session, epoch, context.revision, reference_seq, is_near_only)
+            self._cache.put(key, local)
         return local
 
     def candidates(self, request: CandidatesRequest) -> Candidates:

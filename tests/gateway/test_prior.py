@@ -1,5 +1,7 @@
 """What tracking remembers, from answer to answer."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -109,3 +111,14 @@ def test_a_resumed_session_goes_on_from_its_last_record():
 
 def test_a_new_session_has_no_prior():
     assert resumed_prior(opened(None, [])) is None
+
+
+def test_the_motion_is_the_trackers_where_the_map_moved_between_two_answers(first):
+    step = exp([0.02, 0.0, 0.01, 0.0, 0.03, 0.0])
+    in_the_moved_map = exp([0.5, 0.0, 0.0, 0.0, 0.1, 0.0]) @ step
+    answer = dataclasses.replace(result(1, in_the_moved_map), T_last_camera=step)
+
+    second = after(first, answer)
+
+    np.testing.assert_array_equal(second.T_before_last, step)
+    np.testing.assert_array_equal(second.T_reference_camera, answer.T_reference_camera)

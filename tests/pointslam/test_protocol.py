@@ -100,7 +100,7 @@ def test_no_truth_means_no_novel_scores(room, lit_scene, room_options, tmp_path)
 
 
 def full_metrics(evaluation, room):
-    info = {"keyframes": 4, "iteration_ms": None, "stages_ms": {}, "iterations": 0}
+    info = {"keyframes": 4, "loops": 1, "iteration_ms": None, "stages_ms": {}, "iterations": 0}
     info |= {"primary_anchors": 1, "secondary_anchors": 2, "map_bytes": 3}
     counts = {"sequence": room.name, "mode": "offline", "frames": 34, "tracked": 33}
     wall = {"tracking": 1.0, "mapping": 1.0, "refinement": 0.0, "total": 2.0}

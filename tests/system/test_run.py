@@ -177,7 +177,7 @@ CONTRACT: dict[str, tuple[str, ...]] = {
     "peak_rss_mb": ("gateway", "tracking", "mapping"),
 } | dict.fromkeys(
     [
-        *("sequence", "mode", "frames", "tracked", "lost", "relocalized", "keyframes"),
+        *("sequence", "mode", "frames", "tracked", "lost", "relocalized", "keyframes", "loops"),
         *("ate_online_rmse_m", "ate_final_rmse_m", "ate_online_mean_m", "ate_final_mean_m"),
         *("rpe30_trans_m", "rpe30_rot_deg", "mapping_iterations", "input_fps", "map_mb"),
         *("versions", "git_commit", "seed"),

@@ -83,6 +83,9 @@ class StoreSource:
     def local_map(self, reference_seq: int) -> LocalMap:
         return derive(self._store.context(reference_seq), self._config.registration)
 
+    def loop_map(self, seq: int) -> LocalMap:
+        return derive(self._store.loop_context(seq), self._config.registration)
+
     def candidates(self, request: CandidatesRequest) -> Candidates:
         return self._store.candidates(request)
 

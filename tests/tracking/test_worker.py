@@ -63,13 +63,13 @@ def test_the_least_recently_used_context_leaves_first():
     context = KeyframeStore().context(-1)
     a, b, c = (derive(context, RegistrationConfig()) for _ in range(3))
 
-    cache.put(("s", 1, 1, 0), a)
-    cache.put(("s", 1, 2, 0), b)
-    cache.get(("s", 1, 1, 0))
-    cache.put(("s", 1, 3, 0), c)
+    cache.put(("s", 1, 1, 0, False), a)
+    cache.put(("s", 1, 2, 0, False), b)
+    cache.get(("s", 1, 1, 0, False))
+    cache.put(("s", 1, 3, 0, False), c)
 
-    assert cache.get(("s", 1, 2, 0)) is None
-    assert cache.get(("s", 1, 1, 0)) is a
+    assert cache.get(("s", 1, 2, 0, False)) is None
+    assert cache.get(("s", 1, 1, 0, False)) is a
     assert len(cache) == 2
 
 

@@ -1,0 +1,88 @@
+"""Is this the place of an earlier keyframe? A new keyframe measured in the map around that one.
+
+The map around the earlier keyframe is made of what is near to it in the graph, so the pose found
+in it owes nothing to the drift since then.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.tracking.config import LoopVerificationConfig
+from services.tracking.estimate import Estimate
+from services.tracking.local_map import LocalMap
+from services.tracking.search import Job
+from services.tracking.verification import Step, step_between
+from shared.se3 import inverse
+from shared.tracks import LoopConstraint, Observations
+
+
+def find_loop(job: Job, estimate: Estimate, observations: Observations) -> LoopConstraint | None:
+    """The first of the context's loop candidates that features and depth confirm.
+
+    Args:
+        job: the frame.
+        estimate: its pose as tracked, and the context that names the candidates.
+        observations: of the keyframe that it becomes.
+    """
+    for seq in estimate.local.context.loop_seqs[: job.config.loop.max_candidates]:
+        there = _measure(job, estimate, job.source.loop_map(int(seq)))
+        if there is not None:
+            return _constraint(there, observations)
+    return None
+
+
+def _measure(job: Job, estimate: Estimate, local: LocalMap) -> Estimate | None:
+    """The frame in the map around a candidate: where it is by now, or else where features say."""
+    config = job.config.loop
+    here = job.attempt(local, estimate.T_world_camera)
+    if is_confirmed(here, config) or is_unmoved(here, estimate, config):
+        return here
+    T_located = job.locate(local)
+    if T_located is None:
+        return None
+    there = job.attempt(local, T_located)
+    return there if is_confirmed(there, config) else None
+
+
+def is_confirmed(there: Estimate, config: LoopVerificationConfig) -> bool:
+    """Features say that it is the place, and depth does not refute it."""
+    return (
+        there.inliers >= config.min_inliers
+        and there.inlier_share >= config.min_inlier_share
+        and there.agreement.share >= config.min_agreement
+        and there.registration.overlap >= config.min_overlap
+    )
+
+
+def is_unmoved(there: Estimate, estimate: Estimate, config: LoopVerificationConfig) -> bool:
+    """Geometry alone says so, about where the frame is by its odometry.
+
+    Directions that the geometry leaves open keep that pose; the information says how open.
+    """
+    limit = Step(config.unmoved_m, config.unmoved_deg)
+    return (
+        there.agreement.share >= config.unmoved_min_agreement
+        and there.registration.overlap >= config.unmoved_min_overlap
+        and step_between(estimate.T_world_camera, there.T_world_camera).is_within(limit)
+    )
+
+
+def _constraint(there: Estimate, observations: Observations) -> LoopConstraint:
+    context = there.local.context
+    return LoopConstraint(
+        earlier_seq=context.reference_seq,
+        T_earlier_keyframe=inverse(context.T_world_reference) @ there.T_world_camera,
+        information=there.information,
+        landmark_ids=_same_points(there, observations),
+    )
+
+
+def _same_points(there: Estimate, observations: Observations) -> NDArray[np.int64]:
+    """Landmarks of the earlier map beside the keyframe's own for the same feature, [P, 2]."""
+    features, landmarks = there.matches.features, there.matches.landmarks
+    own = observations.landmark_ids[features]
+    earlier = there.local.context.landmarks.ids[landmarks]
+    keep = (own >= 0) & (own != earlier)
+    return np.column_stack([earlier[keep], own[keep]])
