@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,14 @@ class Way:
         )
 
 
+class EdgeKind(IntEnum):
+    """What told the relative pose of two keyframes."""
+
+    TRACKED = 0
+    JOINED = 1  # a place seen again without drift
+    LOOP = 2  # a place seen again, its drift closed
+
+
 @dataclass(frozen=True)
 class Edge:
     """A measured relative pose of two keyframes, `first` the older one."""
@@ -42,12 +51,14 @@ class Edge:
     second: int
     T_first_second: Matrix  # [4, 4]
     information: Matrix  # [6, 6], of a twist on the right of it
-    is_loop: bool
+    kind: EdgeKind
     depth_m: float  # median of the scene as the second one saw it
 
     @property
     def way(self) -> Way:
-        """Its length."""
+        """Its length: nothing where a place was seen again, since nothing drifts along it."""
+        if self.kind is not EdgeKind.TRACKED:
+            return Way()
         metres = float(np.linalg.norm(self.T_first_second[:3, 3]))
         radians = angle_rad(self.T_first_second)
         return Way(metres / self.depth_m + radians, metres, radians)
@@ -71,7 +82,7 @@ class KeyframeGraph:
     @property
     def num_loops(self) -> int:
         """Edges of recognised places."""
-        return sum(edge.is_loop for edge in self._edges.values())
+        return sum(edge.kind is EdgeKind.LOOP for edge in self._edges.values())
 
     def copy(self) -> KeyframeGraph:
         """The same edges in another graph."""
@@ -97,7 +108,7 @@ class KeyframeGraph:
         for a in moved:
             for b in list(self._ways.get(a, ())):
                 edge = self._edges[min(a, b), max(a, b)]
-                if not edge.is_loop:
+                if edge.kind is not EdgeKind.LOOP:
                     T = inverse(poses[edge.first]) @ poses[edge.second]
                     self.add(replace(edge, T_first_second=T))
 
@@ -123,7 +134,7 @@ class KeyframeGraph:
             "graph.pairs": np.array([(e.first, e.second) for e in edges], np.int64).reshape(-1, 2),
             "graph.T_first_second": _stacked([e.T_first_second for e in edges], 4),
             "graph.information": _stacked([e.information for e in edges], 6),
-            "graph.is_loop": np.array([e.is_loop for e in edges], np.bool_),
+            "graph.kinds": np.array([e.kind for e in edges], np.uint8),
             "graph.depths_m": np.array([e.depth_m for e in edges], np.float64),
         }
 
@@ -136,7 +147,7 @@ class KeyframeGraph:
                     second=second,
                     T_first_second=state["graph.T_first_second"][n],
                     information=state["graph.information"][n],
-                    is_loop=bool(state["graph.is_loop"][n]),
+                    kind=EdgeKind(int(state["graph.kinds"][n])),
                     depth_m=float(state["graph.depths_m"][n]),
                 )
             )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.context import StoredKeyframe
-from services.mapping.keyframe_graph import Edge, KeyframeGraph, Way, linked_keyframes
+from services.mapping.keyframe_graph import Edge, EdgeKind, KeyframeGraph, Way, linked_keyframes
 from services.mapping.landmarks import one_to_one
 from services.mapping.loop_config import LoopConfig
 from services.mapping.loops import (
@@ -66,7 +66,7 @@ class LoopCloser:
     def _edge(self, first: int, second: StoredKeyframe, poses: Poses, information: Matrix) -> Edge:
         """As sure as registration says, less the drift of its way."""
         T = inverse(poses[first]) @ second.T_world_camera
-        edge = Edge(first, second.seq, T, information, False, second.cone.median_m)
+        edge = Edge(first, second.seq, T, information, EdgeKind.TRACKED, second.cone.median_m)
         sigma = self._config.drift_sigma
         noisy = _with_noise(information, sigma.metres(edge.way), sigma.radians(edge.way))
         return replace(edge, information=noisy)
@@ -128,7 +128,7 @@ class LoopCloser:
         """Without drift the two passes are near to each other from here on, as they lie."""
         measured = self._loop_edge(seen)
         T = inverse(poses[measured.first]) @ poses[measured.second]
-        self.graph.add(replace(measured, T_first_second=T, is_loop=False))
+        self.graph.add(replace(measured, T_first_second=T, kind=EdgeKind.JOINED))
 
     def _loop_edge(self, loop: SeenLoop) -> Edge:
         c, sigma = loop.constraint, self._config.loop_sigma
@@ -137,7 +137,7 @@ class LoopCloser:
             second=loop.seq,
             T_first_second=c.T_earlier_keyframe,
             information=_with_noise(c.information, sigma.metres(Way()), sigma.radians(Way())),
-            is_loop=True,
+            kind=EdgeKind.LOOP,
             depth_m=loop.depth_m,
         )
 
@@ -158,7 +158,7 @@ def pose_graph(graph: KeyframeGraph, poses: Poses) -> PoseGraph:
         second=np.array([row[edge.second] for edge in edges], np.int64),
         T_first_second=np.array([edge.T_first_second for edge in edges]),
         information=np.array([edge.information for edge in edges]),
-        is_robust=np.array([edge.is_loop for edge in edges], np.bool_),
+        is_robust=np.array([edge.kind is EdgeKind.LOOP for edge in edges], np.bool_),
     )
 
 
