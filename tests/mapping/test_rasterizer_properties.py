@@ -21,6 +21,7 @@ scenes = st.fixed_dictionaries(
         "depth_range_m": st.sampled_from([0.02, 1.0, 5.0]),
         "log_scale": st.sampled_from([-7.0, -4.0, -2.5, -1.0]),
         "elongation": st.sampled_from([0.0, 0.7, 1.4]),
+        "thinness": st.sampled_from([1.0, 30.0, 1000.0]),
         "opacity": st.sampled_from([(0.0, 0.01), (0.02, 0.9), (0.99, 0.999), (1.0, 1.0)]),
         "spread": st.sampled_from([0.3, 1.0, 4.0]),
     }
@@ -37,9 +38,10 @@ def make(scene):
     z = scene["nearest_m"] + scene["depth_range_m"] * uniform(size)
     xy = scene["spread"] * (uniform(size, 2) - 0.5) * z.abs()[:, None]
     noise = torch.randn(size, 3, generator=generator)
+    thin = torch.tensor([1.0, scene["thinness"], scene["thinness"]])
     return [
         torch.cat([xy, z[:, None]], dim=1),
-        torch.exp(scene["log_scale"] + scene["elongation"] * noise),
+        torch.exp(scene["log_scale"] + scene["elongation"] * noise) / thin,
         torch.randn(size, 4, generator=generator),
         low + (high - low) * uniform(size),
         uniform(size, 3),

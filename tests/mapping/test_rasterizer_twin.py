@@ -24,6 +24,7 @@ class Scene(NamedTuple):
     log_scale: float = -3.0
     log_scale_spread: float = 0.8
     opacity: tuple[float, float] = (0.05, 0.95)
+    thinness: float = 1.0  # length of the first axis over those of the others
 
 
 SCENES = {
@@ -32,6 +33,8 @@ SCENES = {
     "huge": Scene(size=20, log_scale=0.0),
     "tiny": Scene(log_scale=-7.0),
     "elongated": Scene(size=100, log_scale=-4.0, log_scale_spread=1.4),
+    "needles": Scene(size=60, log_scale=-1.5, log_scale_spread=0.3, thinness=1000.0),
+    "near needles": Scene(size=40, depth=(0.2, 0.5), log_scale=-2.0, thinness=1000.0),
     "opaque": Scene(size=100, opacity=(0.99, 0.999)),
     "fully opaque": Scene(size=100, opacity=(1.0, 1.0)),
     "faint": Scene(opacity=(0.0, 0.02)),
@@ -53,9 +56,10 @@ def make(scene, seed=0):
     half = 0.5 * scene.width_per_depth * z.abs()
     means = torch.stack([uniform(-1, 1, len(z)) * half, uniform(-1, 1, len(z)) * half, z], 1)
     spread = torch.randn(scene.size, 3, generator=generator)
+    thinness = torch.tensor([1.0, scene.thinness, scene.thinness])
     return (
         means,
-        torch.exp(scene.log_scale + scene.log_scale_spread * spread),
+        torch.exp(scene.log_scale + scene.log_scale_spread * spread) / thinness,
         torch.randn(scene.size, 4, generator=generator),
         uniform(*scene.opacity, scene.size),
         uniform(0.0, 1.0, scene.size, 3),

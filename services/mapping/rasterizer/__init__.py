@@ -9,8 +9,9 @@ How the CPU backend gets its speed, in the order of the work:
 * **Projection** (`projection`) of LANES Gaussians at a time to records of one cache line each. It
   also counts, per chunk of Gaussians, the hits of every tile.
 * **Binning** (`binning`, `tile_boxes`). Prefix sums over those counts tell each chunk where to
-  write, without locks and in the same order for any number of threads. A tile sorts its own list
-  by depth. Lists that are too long for memory are made for ranges of tiles, one after the other.
+  write, without locks and in the same order for any number of threads. A Gaussian whose box is
+  one row or column of tiles, as nearly all are, goes through one loop without geometry. A tile
+  sorts its own list by depth. Lists too long for memory are made for ranges of tiles in turn.
 * **Blending** (`tiles`, `tiles_forward`) goes Gaussian by Gaussian through a tile whose planes
   stay in the cache. The Gaussians of a batch are first cut into strips of 8 columns that start at
   the ellipse's own left edge, while the records of the next batch are on their way from memory;
@@ -23,7 +24,8 @@ How the CPU backend gets its speed, in the order of the work:
   that the derivative of the projection (`projection_backward`) reads them as a stream.
 * **Memory** (`scratch`). All large arrays, the returned images and gradients included, go back
   to a pool when their last reference is dropped; they start at cache lines.
-* **Threads** (`threads`) take pieces of fixed size from a shared counter.
+* **Threads** (`threads`) take pieces of fixed size from a shared counter. A caller that has done
+  its work alone does not wait for helpers that are busy for another.
 """
 
 from __future__ import annotations
