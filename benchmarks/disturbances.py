@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from shared.camera import Calibration
 from shared.frames import DepthEncoding, Frame
 from shared.images import decode_colour, decode_depth, encode_depth, encode_jpeg
+from shared.se3 import inverse
 
 
 class Sequence(Protocol):
@@ -80,6 +81,51 @@ def to_and_fro(step: int, length: int) -> int:
     """Index of a sequence that is played forwards, backwards, forwards, ..."""
     step %= max(1, 2 * length - 2)
     return step if step < length else 2 * length - 2 - step
+
+
+class MovingBox:
+    """A sequence with a textured box before the camera that covers a third of it and moves."""
+
+    def __init__(self, sequence: Sequence, depth_m: float = 1.8, step_px: float = 6.0) -> None:
+        self.calibration = sequence.calibration
+        self._sequence = sequence
+        self._depth_m = depth_m
+        self._step_px = step_px
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def true_pose(self, index: int) -> NDArray[np.float64]:
+        """T_world_camera, [4, 4]."""
+        return self._sequence.true_pose(index)
+
+    def frame(self, index: int) -> Frame:
+        """One frame; the box sweeps from side to side with the index."""
+        frame, size = self._sequence.frame(index), self.calibration.colour.intrinsics
+        rgb = decode_colour(frame.rgb, size).copy()
+        depth_m = decode_depth(frame.depth, self.calibration)
+        height, width = int(0.75 * size.height), int(0.44 * size.width)
+        left = to_and_fro(round(index * self._step_px), size.width - width)
+        top = (size.height - height) // 2
+        box = np.s_[top : top + height, left : left + width]
+        rgb[box] = _texture(height, width)
+        depth_m[box] = self._front_m(index)[box]
+        with_box = dataclasses.replace(frame, rgb=encode_jpeg(rgb, 95))
+        return _with_depth(with_box, depth_m, self.calibration)
+
+    def _front_m(self, index: int) -> NDArray[np.float64]:
+        """Depth of the plane that the box slides along, [H, W]: it stands in the world."""
+        T = inverse(self.true_pose(0)) @ self.true_pose(index)
+        i = self.calibration.colour.intrinsics
+        u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
+        rays = np.stack([(u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)], axis=-1)
+        return np.maximum(self._depth_m - T[2, 3], 0.5) / np.maximum(rays @ T[2, :3], 0.1)
+
+
+def _texture(height: int, width: int) -> NDArray[np.uint8]:
+    """The box's side: random squares, always the same."""
+    cells = np.random.default_rng(7).integers(0, 256, (height // 9 + 1, width // 9 + 1, 3))
+    return np.kron(cells, np.ones((9, 9, 1), np.int64))[:height, :width].astype(np.uint8)
 
 
 def _stamped(frame: Frame, seq: int, plan: Plan) -> Frame:

@@ -149,7 +149,7 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
     coverage = _coverage(observed, estimate)
-    if not is_well_known(_covariance(estimate.information), config.keyframe):
+    if not is_well_known(_covariance(estimate.information, config), config.keyframe):
         return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
         return None
@@ -202,7 +202,7 @@ def _answer(job: Job, found: Found, keyframe: KeyframeData | None) -> TrackResul
         t_ns=frame.t_ns,
         status=found.status,
         T_world_camera=T,
-        covariance=_covariance(estimate.information),
+        covariance=_covariance(estimate.information, job.config),
         reference_seq=reference_seq,
         T_reference_camera=inverse(T_world_reference) @ T,
         inliers=estimate.inliers,
@@ -229,6 +229,7 @@ def _reference(job: Job, estimate: Estimate) -> tuple[int, NDArray[np.float64]]:
     )
 
 
-def _covariance(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _covariance(information: NDArray[np.float64], config: TrackingConfig) -> NDArray[np.float64]:
     """Inverse of the information; what nothing is known of gets a metre or a radian."""
-    return np.asarray(np.linalg.inv(information + np.eye(6)), np.float64)
+    weakened = information / config.verification.covariance_scale
+    return np.asarray(np.linalg.inv(weakened + np.eye(6)), np.float64)

@@ -1,0 +1,143 @@
+"""One tracking worker over many frames: does it grow, does it slow down?
+
+python -m benchmarks.endurance SEQUENCE [--frames N] [--json FILE]
+
+A worker process tracks a sequence to and fro; the map is in this process. Memory is the worker's
+resident set, time its own CPU, so that a busy machine tells the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.disturbances import to_and_fro
+from benchmarks.tracking import Folder
+from services.gateway.prior import next_prior
+from services.mapping.keyframes import KeyframeStore
+from shared.bus import Bus, Keys, open_bus, open_router
+from shared.frames import Prior, TrackRequest
+from shared.tracks import CandidatesRequest, ContextRequest, TrackResult
+
+_SESSION = "endurance"
+_PERIOD_NS = 33_000_000
+_SPAN = 100  # frames whose times are compared
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one run; CPU is per frame, all threads of the worker together."""
+
+    sequence: str
+    frames: int
+    keyframes: int
+    rss_mb_at: dict[int, float]  # by the number of frames
+    cpu_ms_by_span: list[float]  # mean of every hundred frames
+
+
+@dataclass(frozen=True)
+class Process:
+    """What the kernel knows of a process (Linux)."""
+
+    pid: int
+
+    def cpu_s(self) -> float:
+        """User and system time of all threads."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def rss_mb(self) -> float:
+        """Resident memory."""
+        pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@contextmanager
+def worker(endpoint: str) -> Iterator[Process]:
+    """A worker process that is ready."""
+    command = [sys.executable, "-m", "services.tracking", "--connect", endpoint, "--id", _SESSION]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield Process(process.pid)
+        process.terminate()
+
+
+def run(folder: Folder, name: str, frames: int) -> Row:
+    """Track so many frames of a folder."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    router = open_router(endpoint)
+    try:
+        with open_bus([endpoint]) as bus, worker(endpoint) as process:
+            return _measure(bus, process, folder, name, frames)
+    finally:
+        router.close()
+
+
+def _measure(bus: Bus, process: Process, folder: Folder, name: str, frames: int) -> Row:
+    store = KeyframeStore()
+    _serve(bus, store)
+    prior: Prior | None = None
+    cpu_s, rss_mb = [], {}
+    for seq in range(frames):
+        before_s = process.cpu_s()
+        prior = _track(bus, folder, store, seq, prior)
+        cpu_s.append(process.cpu_s() - before_s)
+        if (seq + 1) % (5 * _SPAN) == 0 or seq + 1 in (_SPAN, frames):
+            rss_mb[seq + 1] = round(process.rss_mb(), 1)
+    spans = np.array(cpu_s[: frames // _SPAN * _SPAN]).reshape(-1, _SPAN)
+    return Row(name, frames, len(store), rss_mb, (1e3 * spans.mean(axis=1)).round(1).tolist())
+
+
+def _serve(bus: Bus, store: KeyframeStore) -> None:
+    bus.serve(
+        Keys.session(_SESSION, 1, "context"),
+        ContextRequest,
+        lambda request: store.context(request.reference_seq),
+    )
+    bus.serve(Keys.session(_SESSION, 1, "candidates"), CandidatesRequest, store.candidates)
+
+
+def _track(
+    bus: Bus, folder: Folder, store: KeyframeStore, seq: int, prior: Prior | None
+) -> Prior | None:
+    frame = folder.frame(to_and_fro(seq, len(folder)))
+    frame = dataclasses.replace(frame, seq=seq, t_ns=seq * _PERIOD_NS)
+    request = TrackRequest(_SESSION, 1, store.revision, folder.calibration, frame, prior, np.eye(4))
+    result = bus.query(Keys.track(_SESSION), request, TrackResult, 30.0)
+    if result.keyframe is not None:
+        store.insert(seq, result.t_ns, result.T_world_camera, result.keyframe)
+    return next_prior(prior, frame, result)
+
+
+def main(argv: list[str]) -> int:
+    """Run over the folder named in argv and print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args(argv)
+    row = run(Folder(arguments.sequence), arguments.sequence.name, arguments.frames)
+    print(row)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(asdict(row), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
