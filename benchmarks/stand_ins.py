@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -246,9 +245,8 @@ def _render(known: _Map, request: RenderRequest) -> RenderReply:
     )
 
 
-def _export(_: ExportRequest) -> Iterator[ExportChunk]:
-    for offset in range(0, 3000, 1000):
-        yield ExportChunk(offset, 3000, bytes([offset // 1000]) * 1000)
+def _export(request: ExportRequest) -> ExportChunk:
+    return ExportChunk(request.offset, 3000, bytes([request.offset // 1000]) * 1000, "1")
 
 
 def _refine(known: _Map, request: RefineRequest) -> JobStatus:

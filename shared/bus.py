@@ -11,7 +11,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any
 
@@ -50,7 +50,7 @@ class Keys:
 
         advance (Advance, AdvanceReply), context (ContextRequest, TrackingContext),
         candidates (CandidatesRequest, Candidates), keyframes (Empty, KeyframePoses),
-        render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk in pieces),
+        render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk),
         refine (RefineRequest, JobStatus), interrupt (Empty, JobStatus), save (SaveRequest,
         SaveReply), info (Empty, MapInfo), trajectory (TrajectoryRequest, Trajectory).
         """
@@ -157,20 +157,16 @@ class Bus:
 
     async def ask(self, key: str, message: object, kind: type, timeout_s: float) -> Any:
         """`query` for asyncio; the event loop never blocks."""
-        async for reply in self.ask_stream(key, message, kind, timeout_s):
-            return reply
-        raise GoneError(f"nobody answers {key}")
-
-    async def ask_stream(
-        self, key: str, message: object, kind: type, timeout_s: float
-    ) -> AsyncIterator[Any]:
-        """Ask and yield every piece of the reply as it comes."""
         loop = asyncio.get_running_loop()
-        replies: asyncio.Queue[zenoh.Reply | None] = asyncio.Queue()
+        answered: asyncio.Future[zenoh.Reply | None] = loop.create_future()
 
-        def put(item: zenoh.Reply | None) -> None:
+        def settle(reply: zenoh.Reply | None) -> None:
+            if not answered.done():
+                answered.set_result(reply)
+
+        def put(reply: zenoh.Reply | None) -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(replies.put_nowait, item)
+                loop.call_soon_threadsafe(settle, reply)
 
         # indirect=False: run on zenoh's own thread instead of one new thread a call.
         handler = zenoh.handlers.Callback(put, lambda: put(None), indirect=False)
@@ -182,8 +178,9 @@ class Bus:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
         )
-        while (reply := await replies.get()) is not None:
-            yield read_reply(reply, key, kind)
+        if (reply := await answered) is None:
+            raise GoneError(f"nobody answers {key}")
+        return read_reply(reply, key, kind)
 
     def serve(
         self,
@@ -194,8 +191,7 @@ class Bus:
     ) -> Callable[[], None]:
         """Answer queries on `key` with `answer(message)`, one at a time or on an executor.
 
-        `answer` returns one message, or an iterator of messages for a reply in pieces. Returns a
-        function that stops serving.
+        Returns a function that stops serving.
         """
 
         def handle(query: zenoh.Query) -> None:

@@ -41,9 +41,15 @@ class ExportFormat(StrEnum):
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """The map as a file; answered in pieces."""
+    """The map as a file, one piece a query, so that the reader sets the pace.
+
+    Without `export` a new file is made and its first piece given; later pieces are asked for by
+    the name that came with it.
+    """
 
     format: ExportFormat
+    export: str = ""
+    offset: int = 0
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,7 @@ class ExportChunk:
     offset: int
     total: int
     bytes: bytes
+    export: str = ""  # by this name the next piece is asked for
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""How an answer crosses the bus: a message, a message in pieces, or an error of ours."""
+"""How an answer crosses the bus: a message, or an error of ours."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,9 +59,7 @@ def answer_query(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any
     with query:
         try:
             payload = query.payload.to_bytes() if query.payload is not None else b""
-            result = answer(codec.unpack(kind, payload))
-            for piece in result if isinstance(result, Iterator) else (result,):
-                query.reply(key, codec.pack(piece))
+            query.reply(key, codec.pack(answer(codec.unpack(kind, payload))))
         except GoneError as error:
             # No reply at all is how a process that is gone answers: the sender looks for another.
             LOGGER.warning("%s: not answered: %s", key, error)

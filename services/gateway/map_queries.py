@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from dataclasses import replace
 
 from services.gateway.config import GatewayConfig
 from services.gateway.session import Session
-from shared.errors import UnavailableError
+from shared.errors import NotFoundError, UnavailableError
 from shared.maps import (
     Empty,
     ExportChunk,
@@ -40,19 +41,19 @@ async def ask_render(
 async def export_pieces(
     session: Session, format: ExportFormat, config: GatewayConfig
 ) -> AsyncIterator[ExportChunk]:
-    """The file in pieces, checked to be in order and complete.
+    """The file in pieces; each is asked for when the one before it has been taken.
 
     Raises:
-        UnavailableError: the owner went away before the end.
+        UnavailableError: the owner, and the file with it, went away before the end.
     """
     await session.flush(config.mapping.question_timeout_s)
     timeout_s = config.mapping.export_timeout_s
-    at = total = 0
-    request = ExportRequest(format)
-    async for piece in session.owner.pieces("export", request, ExportChunk, timeout_s):
-        if piece.offset != at:
-            raise UnavailableError(f"the export broke off at byte {at}")
+    request, at, total = ExportRequest(format), 0, 1
+    while at < total:
+        try:
+            piece: ExportChunk = await session.owner.ask("export", request, ExportChunk, timeout_s)
+        except NotFoundError:
+            raise UnavailableError(f"the export broke off at byte {at} of {total}") from None
         at, total = at + len(piece.bytes), piece.total
         yield piece
-    if at != total:
-        raise UnavailableError(f"the export ended at byte {at} of {total}")
+        request = replace(request, export=piece.export, offset=at)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,21 +94,6 @@ class MapOwner:
             except TimedOutError:
                 if self.mapper in self._fabric.mappers.names:
                     raise
-                await self.reopen(epoch, deadline)
-
-    async def pieces(
-        self, question: str, message: object, kind: type, timeout_s: float
-    ) -> AsyncIterator[Any]:
-        """Ask the owner for a reply in pieces; like `ask` where nobody answers at all."""
-        deadline = time.monotonic() + self._config.reopen_wait_s
-        is_empty = True
-        while is_empty:
-            epoch = self.epoch
-            key = Keys.session(self.session, epoch, question)
-            async for piece in self._fabric.bus.ask_stream(key, message, kind, timeout_s):
-                is_empty = False
-                yield piece
-            if is_empty:
                 await self.reopen(epoch, deadline)
 
     async def reopen(self, epoch: int, deadline: float) -> None:

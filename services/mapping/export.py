@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import tarfile
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,7 +15,6 @@ from services.mapping.pipeline import Mapper
 from services.mapping.rasterizer import Gaussians
 from services.mapping.snapshot import snapshot_folders
 from services.mapping.storage import storage_errors
-from shared.maps import ExportChunk
 
 SH_DC = 0.28209479177387814  # the constant basis function: colour = 0.5 + SH_DC * f_dc
 MIN_OPACITY = 1.0 / 255.0
@@ -26,15 +23,6 @@ _PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-
-
-def chunks(file: BinaryIO, size: int) -> Iterator[ExportChunk]:
-    """A file in pieces of `size` bytes, which is closed then; one piece for an empty file."""
-    with file:
-        total = file.seek(0, os.SEEK_END)
-        for offset in range(0, max(1, total), size):
-            file.seek(offset)
-            yield ExportChunk(offset, total, file.read(size))
 
 
 def export_ply(mapper: Mapper) -> bytes:
@@ -93,9 +81,25 @@ def pack_folder(session: Path) -> BinaryIO:
     snapshots = snapshot_folders(session)
     members = [p for p in session.iterdir() if p.is_file() and p.suffix in _PACKED]
     with storage_errors(str(session)):
-        file = tempfile.TemporaryFile(dir=session)  # noqa: SIM115 - the reader closes it
+        file = _nameless(session)
         with tarfile.open(fileobj=file, mode="w") as archive:
             for path in sorted([*members, *snapshots[-1:]]):
                 archive.add(path, arcname=f"{session.name}/{path.name}")
         file.seek(0)
     return file
+
+
+def spooled(content: bytes, session: Path) -> BinaryIO:
+    """Bytes in a file without a name in the session's folder.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    with storage_errors(str(session)):
+        file = _nameless(session)
+        file.write(content)
+    return file
+
+
+def _nameless(folder: Path) -> BinaryIO:
+    return tempfile.TemporaryFile(dir=folder)

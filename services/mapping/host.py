@@ -57,6 +57,7 @@ from shared.tracks import (
 
 LOGGER = logging.getLogger(__name__)
 _QUERY_THREADS = 8
+_SLOW_THREADS = {"render": 2, "export": 2, "save": 2}  # must not keep trackers waiting for contexts
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,10 @@ class MapperHost:
         self._lock = threading.Lock()
         self._served: dict[str, _Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
+        self._slow = {
+            question: ThreadPoolExecutor(threads, thread_name_prefix=question)
+            for question, threads in _SLOW_THREADS.items()
+        }
         self._is_closed = threading.Event()
         owner = settings.config.owner
         store = open_lease_store(owner.lease_store, settings.data)
@@ -175,7 +180,8 @@ class MapperHost:
             for name in list(self._served):
                 self._put_away(name)
         self._tenure.close()
-        self._queries.shutdown(wait=False, cancel_futures=True)
+        for executor in (self._queries, *self._slow.values()):
+            executor.shutdown(wait=False, cancel_futures=True)
 
     def _put_away_idle(self) -> None:
         """Keep memory bounded: what nobody asks for goes to disk; opening it takes it up again."""
@@ -231,7 +237,8 @@ class MapperHost:
         served = _Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
         record = session.record
         for question, kind, answer in _answers(session):
-            executor = served.advances if question == "advance" else self._queries
+            executor = self._slow.get(question, self._queries)
+            executor = served.advances if question == "advance" else executor
             key = Keys.session(record.session, record.epoch, question)
             served.stops.append(self._bus.serve(key, kind, served.noting_use(answer), executor))
         LOGGER.info(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from services.mapping.entries import check_entry
+from services.mapping.frame_records import FrameRecords
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
 from services.mapping.log import SessionLog, read_log
 from services.mapping.map_state import MapState
@@ -53,8 +54,7 @@ class Ledger:
         self, folder: SessionFolder, record: SessionRecord, config: KeyframeConfig
     ) -> None:
         self._lock = threading.Lock()
-        self._records: dict[int, FrameRecord] = {}
-        self._last: FrameRecord | None = None
+        self._records = FrameRecords()
         self._store = KeyframeStore(config)
         self.resumed = self._resume(folder, record.log_ends, config)
         self._log = SessionLog(folder.log_path(record.epoch))
@@ -70,7 +70,7 @@ class Ledger:
         for name in sorted(log_ends):
             for entry in read_log(folder.path / name, log_ends[name]):
                 if snapshot and len(self._records) < snapshot.entries:
-                    self._remember(entry.record)
+                    self._records.append(entry.record)
                     if entry.frame is not None:
                         resumed.frames[entry.frame.seq] = entry.frame
                 else:
@@ -89,7 +89,7 @@ class Ledger:
     @property
     def last(self) -> FrameRecord | None:
         """The newest answered frame."""
-        return self._last
+        return self._records.last
 
     @property
     def revision(self) -> int:
@@ -125,24 +125,21 @@ class Ledger:
         """
         check_entry(entry)
         with self._lock:
-            if self._last is not None and entry.record.seq <= self._last.seq:
-                raise ConflictError(f"frame {entry.record.seq} is not newer than {self._last.seq}")
+            last, record = self.last, entry.record
+            if last is not None and record.seq <= last.seq:
+                raise ConflictError(f"frame {record.seq} is not newer than {last.seq}")
             with LOG_SECONDS.time():
                 self._log.append(entry)
             return self._apply(entry)
 
     def _apply(self, entry: Advance) -> NewKeyframe | None:
         record = entry.record
-        self._remember(record)
+        self._records.append(record)
         if entry.frame is None or entry.keyframe is None:
             return None
         self._store.insert(record.seq, record.t_ns, record.T_world_camera, entry.keyframe)
         _, landmarks_world = self._store.landmarks_seen_by(record.seq)
         return NewKeyframe(entry.frame, self._store.poses(), landmarks_world)
-
-    def _remember(self, record: FrameRecord) -> None:
-        self._records[record.seq] = record
-        self._last = record
 
     def poses(self) -> KeyframePoses:
         """Present poses of all keyframes."""
@@ -164,7 +161,7 @@ class Ledger:
     def trajectory(self) -> Trajectory:
         """All answered frames, with the corrections of their keyframes applied."""
         with self._lock:
-            records = tuple(self._records.values())
+            records = self._records.all()
             poses = self._store.poses()
         T_world_keyframe = dict(zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True))
         final = [_final_pose(record, T_world_keyframe) for record in records]

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import BinaryIO
 
 import numpy as np
 import torch
 
 from services.mapping.config import MappingConfig
-from services.mapping.export import chunks, export_ply, pack_folder
+from services.mapping.export import export_ply, pack_folder, spooled
+from services.mapping.exports import Exports
 from services.mapping.ledger import Ledger, Resumed
 from services.mapping.mesh import export_mesh
 from services.mapping.metrics import SNAPSHOT_SECONDS
@@ -58,6 +59,7 @@ class Session:
         config = surroundings.config
         self.record = folder.take_up(lease.epoch)
         self.ledger = Ledger(folder, self.record, config.keyframes)
+        self._exports = Exports(config.owner.chunk_bytes)
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._worker = MapWorker(mapper, self.record.mode, config)
@@ -141,17 +143,27 @@ class Session:
             raise InputError("T_world_camera", "must be 4x4 finite numbers")
         return self._worker.visit(lambda mapper: mapper.render(request))
 
-    def export(self, request: ExportRequest) -> Iterator[ExportChunk]:
-        """The map as a file, in pieces."""
-        size = self._surroundings.config.owner.chunk_bytes
-        if request.format is ExportFormat.SNAPSHOT:
+    def export(self, request: ExportRequest) -> ExportChunk:
+        """A piece of the map as a file; see `ExportRequest`.
+
+        Raises:
+            NotFoundError: the export that is named is not under way.
+            StorageError: the disk refused.
+        """
+        if request.export:
+            return self._exports.piece(request.export, request.offset)
+        return self._exports.start(self._exported(request.format))
+
+    def _exported(self, format: ExportFormat) -> BinaryIO:
+        path = self._folder.path
+        if format is ExportFormat.SNAPSHOT:
             if not self._is_saved():
                 self.save()
             with self._saving:
-                return chunks(pack_folder(self._folder.path), size)
-        if request.format is ExportFormat.MESH:
-            return chunks(io.BytesIO(export_mesh(self._worker.visit)), size)
-        return chunks(io.BytesIO(self._worker.visit(export_ply)), size)
+                return pack_folder(path)
+        if format is ExportFormat.MESH:
+            return spooled(export_mesh(self._worker.visit), path)
+        return spooled(self._worker.visit(export_ply), path)
 
     def refine(self, request: RefineRequest) -> JobStatus:
         """Start a refinement over all keyframes."""
@@ -216,6 +228,7 @@ class Session:
         if is_saved:
             self._save_if_near()
         self._worker.stop()
+        self._exports.close()
         self.ledger.close()
 
     def _save_now_and_then(self) -> None:

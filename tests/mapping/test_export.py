@@ -5,10 +5,13 @@ from __future__ import annotations
 import io
 
 import numpy as np
+import pytest
 import torch
 
-from services.mapping.export import chunks, ply_bytes
+from services.mapping.export import ply_bytes
+from services.mapping.exports import MAX_OPEN, Exports
 from services.mapping.rasterizer import Gaussians
+from shared.errors import NotFoundError
 
 
 def gaussians(count: int = 4) -> Gaussians:
@@ -63,15 +66,28 @@ def test_a_map_of_nothing_is_a_ply_without_vertices():
     assert len(read_ply(ply_bytes(gaussians(0)))) == 0
 
 
-def test_pieces_join_to_the_file():
-    data = bytes(range(256)) * 5
+def test_pieces_join_to_the_file_which_is_closed_then():
+    exports, file, data = Exports(100), io.BytesIO(bytes(range(256)) * 5), bytes(range(256)) * 5
 
-    pieces = list(chunks(io.BytesIO(data), 100))
+    pieces = [exports.start(file)]
+    while pieces[-1].offset + 100 < pieces[-1].total:
+        pieces.append(exports.piece(pieces[0].export, pieces[-1].offset + 100))
 
     assert b"".join(piece.bytes for piece in pieces) == data
-    assert [piece.offset for piece in pieces] == list(range(0, 1280, 100))
     assert {piece.total for piece in pieces} == {1280}
+    assert file.closed
 
 
 def test_an_empty_file_is_one_empty_piece():
-    assert [piece.total for piece in chunks(io.BytesIO(), 100)] == [0]
+    assert Exports(100).start(io.BytesIO()).total == 0
+
+
+def test_the_export_that_nobody_reads_makes_room_for_new_ones():
+    exports, files = Exports(2), [io.BytesIO(b"12345") for _ in range(MAX_OPEN + 1)]
+
+    names = [exports.start(file).export for file in files]
+
+    assert [file.closed for file in files] == [True] + [False] * MAX_OPEN
+    assert exports.piece(names[1], 2).bytes == b"34"
+    with pytest.raises(NotFoundError, match="under way"):
+        exports.piece(names[0], 2)

@@ -86,16 +86,6 @@ def test_an_asynchronous_query_is_answered(bus, other):
     assert [reply.session for reply in asyncio.run(run())] == [str(i) for i in range(20)]
 
 
-def test_a_reply_may_come_in_pieces(bus, other):
-    serve(bus, other, DeleteRequest, lambda _: (DeleteRequest(str(i)) for i in range(5)))
-
-    async def run():
-        pieces = bus.ask_stream(KEY, DeleteRequest("x"), DeleteRequest, 2.0)
-        return [piece.session async for piece in pieces]
-
-    assert asyncio.run(run()) == ["0", "1", "2", "3", "4"]
-
-
 @pytest.mark.parametrize(
     "error",
     [
