@@ -240,9 +240,12 @@ def _advance(known: _Map, entry: Advance) -> AdvanceReply:
 def _render(known: _Map, request: RenderRequest) -> RenderReply:
     size = (request.intrinsics.height, request.intrinsics.width)
     rgb = np.full((*size, 3), 128, np.uint8)
-    return RenderReply(
-        len(known.keyframes()), rgb, np.full(size, 1.5, np.float32), np.full(size, 255, np.uint8)
-    )
+    opaque, known_half = np.full(size, 255, np.uint8), np.full(size, 128, np.uint8)
+    state = f"{known.epoch}.{len(known.keyframes())}.{known.refinement.iterations_done}"
+    if request.unless_state == state:
+        rgb, opaque, known_half = rgb[:0], opaque[:0], known_half[:0]
+    depth_m = np.full(opaque.shape, 1.5, np.float32)
+    return RenderReply(len(known.keyframes()), rgb, depth_m, opaque, known_half, state)
 
 
 def _export(request: ExportRequest) -> ExportChunk:

@@ -65,6 +65,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--holdout", type=int, default=8, metavar="K", help="0 holds none out")
     parser.add_argument("--gateway", metavar="URL", help="a running gateway instead of our own")
     parser.add_argument("--seed", type=int, default=0)
+    _add_lpips(parser)
     _add_settings(parser)
     parser.set_defaults(command=_run)
 
@@ -84,6 +85,7 @@ def _run(arguments: argparse.Namespace) -> None:
         gateway=arguments.gateway,
         seed=arguments.seed,
         num_trackers=arguments.trackers,
+        lpips_weights=arguments.lpips_weights,
         settings=read_settings(arguments.config, arguments.set),
     )
     _say(text_table(run_sequence(options)))
@@ -91,6 +93,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="DIR")
+    _add_lpips(parser)
     parser.set_defaults(command=_evaluate)
 
 
@@ -98,7 +101,16 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     from pointslam.evaluation.report import text_table
     from pointslam.run import evaluate_run
 
-    _say(text_table(evaluate_run(arguments.run)))
+    _say(text_table(evaluate_run(arguments.run, arguments.lpips_weights)))
+
+
+def _add_lpips(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--lpips-weights",
+        type=Path,
+        metavar="PATH",
+        help="AlexNet's or VGG16's, safetensors; LPIPS is null without",
+    )
 
 
 def _add_up(parser: argparse.ArgumentParser) -> None:

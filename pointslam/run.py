@@ -16,6 +16,8 @@ from pointslam.client import Client, Session
 from pointslam.datasets import Sequence, open_sequence
 from pointslam.evaluation import metrics as entries
 from pointslam.evaluation.evaluate import evaluate_session, write_evaluation
+from pointslam.evaluation.lpips import Lpips
+from pointslam.evaluation.protocol import EvaluationOutput
 from pointslam.launcher import LaunchOptions, Services
 from pointslam.progress import progress_bar
 from pointslam.run_folder import RunFolder, RunRecord
@@ -29,7 +31,10 @@ MODES = ("offline", "live")
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What to run, and how. Without `gateway` the services are started for the run."""
+    """What to run, and how. Without `gateway` the services are started for the run.
+
+    `lpips_weights` is a safetensors file; without it metrics.json has null for LPIPS.
+    """
 
     sequence: Path
     out: Path
@@ -41,6 +46,7 @@ class RunOptions:
     gateway: str | None = None
     seed: int = 0
     num_trackers: int = 2
+    lpips_weights: Path | None = None
     settings: RunSettings = field(default_factory=RunSettings)
 
     def __post_init__(self) -> None:
@@ -102,6 +108,7 @@ def run_sequence(options: RunOptions) -> dict[str, Any]:
         PointSlamError: a frame was refused or a service failed.
     """
     sequence = open_sequence(options.sequence, options.settings.sequence)
+    lpips = _lpips(options.lpips_weights)
     folder = prepare_folder(options.out)
     with _gateway(options, folder) as gateway, Client(gateway.url) as client:
         session = client.create_session(sequence.calibration, mode=options.mode, seed=options.seed)
@@ -110,7 +117,8 @@ def run_sequence(options: RunOptions) -> dict[str, Any]:
         folder.write_record(record)
         export_map(session, folder)
         with progress_bar("scores", "view") as progress:
-            evaluation = evaluate_session(session, sequence, options.holdout, folder, progress)
+            output = EvaluationOutput(folder.renders, options.holdout, progress, lpips)
+            evaluation = evaluate_session(session, sequence, output)
         metrics = {
             **_counts(record, sequence, streamed),
             **evaluation.entries(options.holdout),
@@ -123,21 +131,28 @@ def run_sequence(options: RunOptions) -> dict[str, Any]:
     return metrics
 
 
-def evaluate_run(path: Path) -> dict[str, Any]:
+def evaluate_run(path: Path, lpips_weights: Path | None = None) -> dict[str, Any]:
     """Score a finished run again from its saved map; returns the new metrics.
 
     Raises:
         SequenceError: there is no run, or its sequence cannot be read any more.
+        ConfigError: the weights of LPIPS cannot be read.
     """
+    lpips = _lpips(lpips_weights)
     folder = RunFolder(path)
     record = folder.read_record()
     metrics = folder.read_metrics()
     sequence = open_sequence(record.sequence, record.sequence_options)
     with open_saved_session(folder, record) as session, progress_bar("scores", "view") as progress:
-        evaluation = evaluate_session(session, sequence, record.holdout, folder, progress)
+        output = EvaluationOutput(folder.renders, record.holdout, progress, lpips)
+        evaluation = evaluate_session(session, sequence, output)
     metrics |= evaluation.entries(record.holdout)
     write_evaluation(folder, sequence, record, evaluation, metrics)
     return metrics
+
+
+def _lpips(weights: Path | None) -> Lpips | None:
+    return None if weights is None else Lpips.read(weights)
 
 
 @contextmanager

@@ -14,21 +14,32 @@ from shared.tracks import FrameRecord
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """A view of the map. Without a time the map's mean appearance is drawn."""
+    """A view of the map. Without a time the map's mean appearance is drawn.
+
+    `unless_state` is the state of a reply that the asker still has: while the map would give it
+    again, the new reply has that state and images without pixels.
+    """
 
     T_world_camera: NDArray[np.float64]  # [4, 4]
     intrinsics: Intrinsics
     appearance_t_ns: int | None = None
+    unless_state: str = ""
 
 
 @dataclass(frozen=True)
 class RenderReply:
-    """A rendered view. Depth is 0 where alpha is 0; a view of nothing is black with alpha 0."""
+    """A rendered view. Depth is 0 where alpha is 0; a view of nothing is black with alpha 0.
+
+    Confidence says how well the map knows what it shows: 255 where keyframes saw the surface from
+    much the same side and distance, 0 where nothing is known.
+    """
 
     revision: int
     rgb: NDArray[np.uint8]  # [H, W, 3]
     depth_m: NDArray[np.float32]  # [H, W], along the optical axis
     alpha: NDArray[np.uint8]  # [H, W], 255 is opaque
+    confidence: NDArray[np.uint8]  # [H, W]
+    state: str = ""  # epoch.revision.iterations of the map that was drawn
 
 
 class ExportFormat(StrEnum):

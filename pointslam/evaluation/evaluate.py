@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,14 +39,8 @@ class Evaluation:
         return trajectory_entries(self.trajectories) | image_entries(self.images, holdout)
 
 
-def evaluate_session(
-    session: Session,
-    sequence: Sequence,
-    holdout: int,
-    folder: RunFolder,
-    progress: Callable[[int, int], None],
-) -> Evaluation:
-    """Fetch poses and views of a session and score them; pictures go to the run's folder."""
+def evaluate_session(session: Session, sequence: Sequence, output: EvaluationOutput) -> Evaluation:
+    """Fetch poses and views of a session and score them."""
     records = session.trajectory()
     with_pose = [r for r in records if r.status in HAS_POSE]
     online = {r.seq: r.T_map_camera_online for r in with_pose}
@@ -56,8 +49,7 @@ def evaluate_session(
     drawn = {r.seq: r.T_map_camera_online for r in records} | final
     trajectories = score_trajectories(sequence, online, final)
     T_truth_map = trajectories.final.T_truth_map if trajectories.final else None
-    folder.renders.mkdir(parents=True, exist_ok=True)
-    output = EvaluationOutput(folder.renders, holdout, progress)
+    output.folder.mkdir(parents=True, exist_ok=True)
     images = score_run(session, sequence, drawn, T_truth_map, output)
     keyframes = tuple(r.seq for r in with_pose if r.keyframe)
     lost = tuple(r.T_map_camera_online for r in records if r.status is TrackingStatus.LOST)

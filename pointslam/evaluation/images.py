@@ -1,8 +1,4 @@
-"""How alike two pictures are: PSNR, plain SSIM as in 3D Gaussian splatting, depth error.
-
-LPIPS is not computed: its network weights cannot be had without a download, so metrics.json holds
-null for it.
-"""
+"""How alike two pictures are: PSNR, plain SSIM as in 3D Gaussian splatting, depth error."""
 
 from __future__ import annotations
 

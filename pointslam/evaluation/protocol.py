@@ -32,6 +32,7 @@ _NUM_SAVED = 6
 _MAX_WAITING = 4
 
 Progress = Callable[[int, int], None]
+Distance = Callable[[images.Rgb, images.Rgb], float]
 
 
 class Renderer(Protocol):
@@ -55,8 +56,10 @@ class ViewScore:
     psnr_db: float | None
     ssim: float
     depth_l1_m: float | None
+    lpips: float | None
     masked_psnr_db: float | None
     masked_ssim: float
+    masked_lpips: float | None
     psnr_seen_db: float | None
     seen: float  # share of pixels with rendered alpha above 0.9
 
@@ -98,11 +101,15 @@ def score_run(
 
 @dataclass(frozen=True)
 class EvaluationOutput:
-    """Where pictures go (rendered beside true), which frames were held out, who is told."""
+    """Where pictures go (rendered beside true), which frames were held out, who is told.
+
+    `lpips` measures perceptual distances, where the user has weights for it.
+    """
 
     folder: Path
     holdout: int
     progress: Progress
+    lpips: Distance | None = None
 
 
 def _frame_tasks(sequence: Sequence, poses: dict[int, Matrix], holdout: int) -> Iterator[_Task]:
@@ -155,27 +162,30 @@ def _score_all(
     with ThreadPoolExecutor(1) as pool:
         for done, task in enumerate(tasks, 1):
             reply = renderer.render(task.T_map_camera, appearance_t_ns=task.appearance_t_ns)
-            waiting.append(pool.submit(_score, task, reply, output.folder))
+            waiting.append(pool.submit(_score, task, reply, output))
             if len(waiting) > _MAX_WAITING:
                 yield waiting.pop(0).result()
             output.progress(done, len(tasks))
         yield from (future.result() for future in waiting)
 
 
-def _score(task: _Task, reply: RenderReply, folder: Path) -> ViewScore:
+def _score(task: _Task, reply: RenderReply, output: EvaluationOutput) -> ViewScore:
     truth = task.truth()
     if task.is_saved:
         pair = np.concatenate([reply.rgb, truth.rgb], axis=1)
-        (folder / f"{task.name}.png").write_bytes(encode_png(pair))
+        (output.folder / f"{task.name}.png").write_bytes(encode_png(pair))
     is_seen = reply.alpha > _SEEN_ALPHA
     ours, theirs = images.masked(reply.rgb, truth.depth_m), images.masked(truth.rgb, truth.depth_m)
+    lpips = output.lpips or (lambda *_: None)
     return ViewScore(
         index=task.index,
         psnr_db=images.psnr_db(reply.rgb, truth.rgb),
         ssim=images.ssim(reply.rgb, truth.rgb),
         depth_l1_m=images.depth_l1_m(reply.depth_m, reply.alpha, truth.depth_m),
+        lpips=lpips(reply.rgb, truth.rgb),
         masked_psnr_db=images.psnr_db(ours, theirs),
         masked_ssim=images.ssim(ours, theirs),
+        masked_lpips=lpips(ours, theirs),
         psnr_seen_db=images.psnr_db(reply.rgb, truth.rgb, is_seen),
         seen=float(is_seen.mean()),
     )
@@ -193,7 +203,7 @@ def block(scores: Iterable[ViewScore]) -> dict[str, float | None]:
     return {
         "psnr_db": mean(s.psnr_db for s in scores),
         "ssim": mean(s.ssim for s in scores),
-        "lpips": None,
+        "lpips": mean(s.lpips for s in scores),
         "depth_l1_m": mean(s.depth_l1_m for s in scores),
     }
 
@@ -213,5 +223,5 @@ def gsicp_block(scores: Iterable[ViewScore]) -> dict[str, float | None]:
     return {
         "psnr_db": mean(s.masked_psnr_db for s in scores),
         "ssim": mean(s.masked_ssim for s in scores),
-        "lpips": None,
+        "lpips": mean(s.masked_lpips for s in scores),
     }

@@ -15,7 +15,7 @@ from services.gateway.frame_stream import FrameStream, SlowClientError
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import CreateRequest, Sessions
-from services.gateway.views import View
+from services.gateway.views import View, mean_confidence
 from services.gateway.wire_values import (
     calibration_from,
     chosen,
@@ -51,6 +51,8 @@ _CONTENTS = {
     map_service_pb2.VIEW_CONTENT_UNSPECIFIED: "colour",
     map_service_pb2.VIEW_CONTENT_COLOUR: "colour",
     map_service_pb2.VIEW_CONTENT_DEPTH: "depth",
+    map_service_pb2.VIEW_CONTENT_ALPHA: "alpha",
+    map_service_pb2.VIEW_CONTENT_CONFIDENCE: "confidence",
 }
 _IMAGES = {
     map_service_pb2.IMAGE_FORMAT_UNSPECIFIED: "jpeg",
@@ -246,6 +248,8 @@ class MapService(map_service_pb2_grpc.MapServiceServicer):
                 map_revision=reply.revision,
                 format=_IMAGE_VALUES[view.format],
                 image=await asyncio.to_thread(view.encode, reply),
+                confidence=mean_confidence(reply),
+                state=reply.state,
             )
 
     async def ExportMap(self, request: Any, context: Any) -> AsyncIterator[Any]:

@@ -13,10 +13,10 @@ from starlette.responses import Response, StreamingResponse
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
 from services.gateway.decode import plain
-from services.gateway.map_queries import ask_render, export_pieces, map_state
+from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
-from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, pose_from
+from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, mean_confidence, pose_from
 from shared import codec
 from shared.errors import InputError
 from shared.maps import (
@@ -60,7 +60,10 @@ class CameraQuery:
 
 @dataclass(frozen=True)
 class ViewQuery:
-    """What is drawn (colour or depth), as what (jpeg, png, msgpack), in whose appearance."""
+    """What is drawn (colour, depth, alpha, confidence), as what (jpeg, png, msgpack), when.
+
+    Without a time it has the map's mean exposure.
+    """
 
     what: str = "colour"
     format: str = "jpeg"
@@ -91,17 +94,23 @@ def _add_render_route(router: APIRouter, sessions: Sessions) -> None:
         camera: Annotated[CameraQuery, Depends()],
         wanted: Annotated[ViewQuery, Depends()],
     ) -> Response:
-        """A view of the map as an image; If-None-Match with its ETag answers 304."""
+        """A view of the map as an image, and how well it is known (0 to 1) in X-Confidence.
+
+        Its ETag is of the map that is shown. If-None-Match with it answers 304 for as long as the
+        same view would come again: the map has not changed, or by a few steps of its
+        optimisation only (render.max_iterations, render.max_age_s of the mapper).
+        """
         session = await sessions.get(name)
         view = _view(session, pose, camera, wanted)
         view.check(config.limits.max_render_pixels)
-        etag = view.etag(await map_state(session, config))
-        if etag in request.headers.get("if-none-match", ""):
-            return Response(status_code=304, headers={"ETag": etag})
-        reply = await ask_render(session, view.request, config)
+        wanted_now = view.unless(request.headers.get("if-none-match", ""))
+        reply = await ask_render(session, wanted_now, config)
+        headers = {"ETag": view.etag(reply.state), "Cache-Control": "no-cache"}
+        if reply.state == wanted_now.unless_state:
+            return Response(status_code=304, headers=headers)
         # Encoding takes 10 ms and more; frames go on meanwhile.
         content = await asyncio.to_thread(view.encode, reply)
-        headers = {"ETag": etag, "Cache-Control": "no-cache"}
+        headers["X-Confidence"] = f"{mean_confidence(reply):.3f}"
         return Response(content, 200, headers, MEDIA_TYPES[view.format])
 
 

@@ -9,25 +9,12 @@ from services.gateway.config import GatewayConfig
 from services.gateway.session import Session
 from shared.errors import NotFoundError, UnavailableError
 from shared.maps import (
-    Empty,
     ExportChunk,
     ExportFormat,
     ExportRequest,
-    MapInfo,
     RenderReply,
     RenderRequest,
 )
-
-
-async def map_state(session: Session, config: GatewayConfig) -> str:
-    """What changes whenever a view of the map may: its owner, its keyframes, its optimisation.
-
-    Ask before rendering: a tag that is older than the view costs one more transfer, a newer one
-    would hide a change.
-    """
-    timeout_s = config.mapping.question_timeout_s
-    info: MapInfo = await session.owner.ask("info", Empty(), MapInfo, timeout_s)
-    return f"{info.epoch}.{info.map_revision}.{info.iterations}"
 
 
 async def ask_render(

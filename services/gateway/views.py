@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from shared.se3 import Pose, Quaternion, Vector3
 
 DEPTH_SCALE = 1000.0  # units per metre of a depth PNG
 MEDIA_TYPES = {"jpeg": "image/jpeg", "png": "image/png", "msgpack": "application/msgpack"}
-WHATS = ("colour", "depth")
+WHATS = ("colour", "depth", "alpha", "confidence")
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,21 @@ class View:
             raise InputError("what", f"must be one of {', '.join(WHATS)}")
         if self.format not in MEDIA_TYPES:
             raise InputError("format", f"must be one of {', '.join(MEDIA_TYPES)}")
-        if self.what == "depth" and self.format == "jpeg":
-            raise InputError("format", "depth comes as png or msgpack")
+        if self.what != "colour" and self.format == "jpeg":
+            raise InputError("format", f"{self.what} comes as png or msgpack")
 
     def etag(self, state: str) -> str:
-        """A strong entity tag: the map's state and this view."""
+        """A strong entity tag: the state of the map that is shown, and this view."""
+        return f'"{state}-{self._digest()}"'
+
+    def unless(self, if_none_match: str) -> RenderRequest:
+        """The request of a client that has this view with one of these tags."""
+        known = re.search(rf'"([\d.]+)-{self._digest()}"', if_none_match)
+        return dataclasses.replace(self.request, unless_state=known[1]) if known else self.request
+
+    def _digest(self) -> str:
         content = codec.pack(self.request) + f"{self.what} {self.format}".encode()
-        return f'"{state}-{hashlib.blake2b(content, digest_size=12).hexdigest()}"'
+        return hashlib.blake2b(content, digest_size=12).hexdigest()
 
     def encode(self, reply: RenderReply) -> bytes:
         """The file."""
@@ -56,9 +65,16 @@ class View:
             return codec.pack(reply)
         if self.what == "depth":
             return images.encode_png(_millimetres(reply.depth_m))
+        if self.what != "colour":
+            return images.encode_png(reply.alpha if self.what == "alpha" else reply.confidence)
         if self.format == "png":
             return images.encode_png(reply.rgb)
         return images.encode_jpeg(reply.rgb).bytes
+
+
+def mean_confidence(reply: RenderReply) -> float:
+    """How well the map knows the view as a whole, 0 to 1."""
+    return float(reply.confidence.mean()) / 255.0 if reply.confidence.size else 0.0
 
 
 def _millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:

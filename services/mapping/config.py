@@ -138,6 +138,19 @@ class ScheduleConfig:
 
 
 @dataclass(frozen=True)
+class RenderConfig:
+    """Drawn views that are kept (see `render_cache`)."""
+
+    cache_mb: int = 48
+    max_iterations: int = 10  # a kept view may be so many steps of optimisation behind the map
+    max_age_s: float = 0.5  # and so old, while the map is optimised
+
+    def __post_init__(self) -> None:
+        _check(self.cache_mb >= 0, "render.cache_mb must not be negative")
+        _check(self.max_iterations >= 0, "render.max_iterations must not be negative")
+
+
+@dataclass(frozen=True)
 class OwnerConfig:
     """The session around the map."""
 
@@ -170,5 +183,6 @@ class MappingConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
     owner: OwnerConfig = field(default_factory=OwnerConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)

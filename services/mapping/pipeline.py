@@ -1,11 +1,13 @@
 """The mapper: keyframes in, a map of neural Gaussians that renders any view.
 
-It takes values and returns values and never sees the bus; one thread at a time.
+It takes values and returns values and never sees the bus; one thread at a time, except that any
+thread may ask for renders.
 """
 
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,8 +36,10 @@ from services.mapping.map_state import (
 )
 from services.mapping.optimizer import adam_rows, begin_step
 from services.mapping.rasterizer import View, rasterizer_for
-from services.mapping.render import Drawn, Painter, to_reply
+from services.mapping.render import Drawn, Painter, to_images
+from services.mapping.render_cache import Moment
 from services.mapping.seeding import SeedRequest, seed_anchors
+from services.mapping.sightings import Sightings
 from services.mapping.training_views import TrainingView, TrainingViews
 from shared import se3
 from shared.camera import Calibration
@@ -62,28 +66,6 @@ class NewKeyframe:
         return self.poses.T_world_keyframes[self.poses.seqs == self.frame.seq][0]
 
 
-@dataclass(frozen=True)
-class MapFigures:
-    """What a map amounts to, in numbers."""
-
-    anchors: int
-    primary: int
-    iterations: int
-    psnr_db: float | None
-    num_bytes: int  # anchors and networks, without optimizer state
-
-    @staticmethod
-    def of(mapper: Mapper) -> MapFigures:
-        """The figures of a mapper at this moment."""
-        return MapFigures(
-            anchors=len(mapper.anchors),
-            primary=mapper.anchors.num_primary,
-            iterations=mapper.iterations,
-            psnr_db=mapper.psnr_db,
-            num_bytes=mapper.anchors.num_bytes + mapper.decoder.num_bytes,
-        )
-
-
 class Mapper:
     """The anchor map of one session with its networks, optimizer and training views."""
 
@@ -104,14 +86,21 @@ class Mapper:
         self.views = TrainingViews(
             calibration, config.schedule, seed, lambda image: Target.of(image, device)
         )
+        self.sightings = Sightings(calibration)
         self._placed: dict[int, NDArray[np.float64]] = {}  # poses that the anchors are placed by
         self._loss = mapping_loss_cpu if device.type == "cpu" else mapping_loss
         self._rng = np.random.default_rng([seed, 0])
         self._background = np.zeros(3, np.float32)
+        self._changing = threading.Lock()  # held while what a render reads is not consistent
         self.iterations = 0
         self.revision = 0
         self.stages = StageTimes()
         self._squared_errors: deque[float] = deque(maxlen=_PSNR_WINDOW)
+
+    @property
+    def moment(self) -> Moment:
+        """Changes whenever a view of the map may."""
+        return Moment(self.revision, self.iterations)
 
     @property
     def psnr_db(self) -> float | None:
@@ -131,7 +120,7 @@ class Mapper:
         Raises:
             InputError: an image of the keyframe cannot be decoded.
         """
-        with self.stages.stage("insert_keyframe"):
+        with self.stages.stage("insert_keyframe"), self._changing:
             self._follow_corrections(keyframe.poses)
             image = self._add_view(keyframe)
             pose, config = keyframe.T_world_camera, self.config.anchors
@@ -157,10 +146,22 @@ class Mapper:
 
     def render(self, request: RenderRequest) -> RenderReply:
         """A view of the map, with the exposure of a time or the mean one."""
+        return self.render_at(request)[1]
+
+    @torch.no_grad()
+    def render_at(self, request: RenderRequest) -> tuple[Moment, RenderReply]:
+        """A view, and which map it shows; waits while a step writes, and draws beside the next."""
         view = View(se3.inverse(request.T_world_camera), request.intrinsics)
-        exposure = torch.from_numpy(self.exposures.at(request.appearance_t_ns))
-        appearance = self._appearance(exposure.to(self._device))
-        return to_reply(self.painter.draw(view), appearance, self.revision)
+        with self._changing:
+            moment = self.moment
+            visible, gaussians = self.painter.decode(view, is_trained=False)
+            exposure = torch.from_numpy(self.exposures.at(request.appearance_t_ns))
+            appearance = self._appearance(exposure.to(self._device))
+            keyframes = self.views.all()
+        drawn = Drawn(visible, gaussians, self.painter.rasterizer(gaussians, view))
+        images = to_images(drawn, appearance)
+        confidence = self.sightings.confidence(images, view, keyframes)
+        return moment, RenderReply(moment.revision, *images, confidence)
 
     def state(self) -> MapState:
         """Everything that a snapshot needs to go on exactly as if nothing had happened."""
@@ -216,11 +217,11 @@ class Mapper:
                 loss = self._loss(drawn.rendered, target, appearance, self.config.loss)
             with self.stages.stage("backward"):
                 loss.total.backward()
-            with self.stages.stage("update"):
+            with self.stages.stage("update"), self._changing:
                 self._update(drawn, rate)
                 assert exposure.grad is not None
                 self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rate)
-            self._densify(drawn)
+                self._densify(drawn)
         self._squared_errors.append(float(loss.squared_error))
 
     def _draw(self, keyframe: TrainingView, target: Target) -> Drawn:
@@ -276,6 +277,7 @@ class Mapper:
         frame = keyframe.frame
         view = TrainingView(frame.seq, frame.t_ns, frame, keyframe.T_world_camera)
         image = self.views.add(view)
+        self.sightings.add(frame.seq, image)
         self._placed[frame.seq] = keyframe.T_world_camera
         self.exposures.add(frame.seq, frame.t_ns)
         mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
@@ -283,4 +285,5 @@ class Mapper:
         return image
 
     def _appearance(self, exposure: Tensor) -> Appearance:
-        return Appearance(torch.from_numpy(self._background).to(self._device), exposure)
+        background = torch.from_numpy(self._background.copy())
+        return Appearance(background.to(self._device), exposure)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from services.mapping.anchors import AnchorMap
@@ -13,7 +15,6 @@ from services.mapping.config import DecoderConfig
 from services.mapping.decoders import Decoder, Visible
 from services.mapping.losses import Appearance
 from services.mapping.rasterizer import Gaussians, Rasterizer, Rendered, View
-from shared.maps import RenderReply
 
 MIN_DEPTH_M = 0.2
 MARGIN_PX = 24.0  # an anchor's children reach into the image from outside
@@ -84,7 +85,15 @@ def visible_index(anchors: AnchorMap, view: View, limit: int) -> Tensor:
     return index
 
 
-def to_reply(drawn: Drawn, appearance: Appearance, revision: int) -> RenderReply:
+class Images(NamedTuple):
+    """A view as it is given away."""
+
+    rgb: NDArray[np.uint8]  # [H, W, 3]
+    depth_m: NDArray[np.float32]  # [H, W], along the optical axis, 0 where nothing is drawn
+    alpha: NDArray[np.uint8]  # [H, W]
+
+
+def to_images(drawn: Drawn, appearance: Appearance) -> Images:
     """8-bit colour, depth along the axis, and alpha; a view of nothing is black."""
     rendered = drawn.rendered
     alpha = rendered.alpha.clamp(0.0, 1.0)
@@ -93,12 +102,7 @@ def to_reply(drawn: Drawn, appearance: Appearance, revision: int) -> RenderReply
         image = torch.zeros_like(image)
     is_drawn = alpha > _MIN_ALPHA
     depth = torch.where(is_drawn, rendered.depth / alpha.clamp_min(_MIN_ALPHA), 0.0)
-    return RenderReply(
-        revision=revision,
-        rgb=_bytes(image),
-        depth_m=depth.cpu().numpy(),
-        alpha=_bytes(alpha),
-    )
+    return Images(_bytes(image), depth.cpu().numpy(), _bytes(alpha))
 
 
 def _bytes(image: Tensor) -> np.ndarray:

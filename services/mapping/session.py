@@ -14,10 +14,12 @@ import torch
 from services.mapping.config import MappingConfig
 from services.mapping.export import export_ply, pack_folder, spooled
 from services.mapping.exports import Exports
+from services.mapping.figures import MapFigures
 from services.mapping.ledger import Ledger, Resumed
 from services.mapping.mesh import export_mesh
 from services.mapping.metrics import SNAPSHOT_SECONDS
-from services.mapping.pipeline import MapFigures, Mapper
+from services.mapping.pipeline import Mapper
+from services.mapping.renders import Renders
 from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
 from services.mapping.tenure import Lease
@@ -62,6 +64,7 @@ class Session:
         self._exports = Exports(config.owner.chunk_bytes)
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
+        self._renders = Renders(mapper, self.record.epoch, config.render)
         self._worker = MapWorker(mapper, self.record.mode, config)
         self._take_up(mapper)
         self._calm = threading.Lock()  # held while a snapshot wants no new entries
@@ -133,7 +136,7 @@ class Session:
         return AdvanceReply(entry.record.seq, self.ledger.revision)
 
     def render(self, request: RenderRequest) -> RenderReply:
-        """A view of the map; waits for one iteration at most.
+        """A view of the map, with how well it is known; may be a kept one (`render_cache`).
 
         Raises:
             InputError: the view is no camera.
@@ -141,7 +144,7 @@ class Session:
         request.intrinsics.check("intrinsics")
         if request.T_world_camera.shape != (4, 4) or not np.isfinite(request.T_world_camera).all():
             raise InputError("T_world_camera", "must be 4x4 finite numbers")
-        return self._worker.visit(lambda mapper: mapper.render(request))
+        return self._renders.answer(request)
 
     def export(self, request: ExportRequest) -> ExportChunk:
         """A piece of the map as a file; see `ExportRequest`.

@@ -75,6 +75,10 @@ class TrainingViews:
     def __getitem__(self, seq: int) -> TrainingView:
         return self._views[seq]
 
+    def all(self) -> list[TrainingView]:
+        """Every keyframe with its present pose, in order."""
+        return list(self._views.values())
+
     def seqs(self) -> list[int]:
         """Seqs of all keyframes, ascending."""
         return list(self._views)

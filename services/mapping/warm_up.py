@@ -11,6 +11,7 @@ from services.mapping.pipeline import Mapper, NewKeyframe
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import DepthEncoding, Frame
 from shared.images import encode_depth, encode_jpeg
+from shared.maps import RenderRequest
 from shared.tracks import KeyframePoses
 
 
@@ -28,3 +29,4 @@ def warm_up() -> None:
     mapper = Mapper(calibration, MappingConfig(), 0, torch.device("cpu"))
     mapper.insert_keyframe(NewKeyframe(frame, poses, np.zeros((0, 3))))
     mapper.iterate()
+    mapper.render(RenderRequest(np.eye(4), size))

@@ -12,6 +12,8 @@ class ViewContent(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     VIEW_CONTENT_UNSPECIFIED: _ClassVar[ViewContent]
     VIEW_CONTENT_COLOUR: _ClassVar[ViewContent]
     VIEW_CONTENT_DEPTH: _ClassVar[ViewContent]
+    VIEW_CONTENT_ALPHA: _ClassVar[ViewContent]
+    VIEW_CONTENT_CONFIDENCE: _ClassVar[ViewContent]
 
 class ImageFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -28,6 +30,8 @@ class MapFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
 VIEW_CONTENT_UNSPECIFIED: ViewContent
 VIEW_CONTENT_COLOUR: ViewContent
 VIEW_CONTENT_DEPTH: ViewContent
+VIEW_CONTENT_ALPHA: ViewContent
+VIEW_CONTENT_CONFIDENCE: ViewContent
 IMAGE_FORMAT_UNSPECIFIED: ImageFormat
 IMAGE_FORMAT_JPEG: ImageFormat
 IMAGE_FORMAT_PNG: ImageFormat
@@ -91,14 +95,18 @@ class RenderViewRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., intrinsics: _Optional[_Union[_types_pb2.Intrinsics, _Mapping]] = ..., appearance_t_ns: _Optional[int] = ..., content: _Optional[_Union[ViewContent, str]] = ..., format: _Optional[_Union[ImageFormat, str]] = ...) -> None: ...
 
 class RenderViewResponse(_message.Message):
-    __slots__ = ("map_revision", "format", "image")
+    __slots__ = ("map_revision", "format", "image", "confidence", "state")
     MAP_REVISION_FIELD_NUMBER: _ClassVar[int]
     FORMAT_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
     map_revision: int
     format: ImageFormat
     image: bytes
-    def __init__(self, map_revision: _Optional[int] = ..., format: _Optional[_Union[ImageFormat, str]] = ..., image: _Optional[bytes] = ...) -> None: ...
+    confidence: float
+    state: str
+    def __init__(self, map_revision: _Optional[int] = ..., format: _Optional[_Union[ImageFormat, str]] = ..., image: _Optional[bytes] = ..., confidence: _Optional[float] = ..., state: _Optional[str] = ...) -> None: ...
 
 class ExportMapRequest(_message.Message):
     __slots__ = ("session_id", "format")

@@ -162,6 +162,7 @@ def test_a_view_is_an_image_of_the_asked_camera(track, maps, name, calibration):
         ColourImage(ColourEncoding.JPEG, view.image), calibration.colour.intrinsics
     )
     assert view.format == map_service_pb2.IMAGE_FORMAT_JPEG
+    assert view.confidence == pytest.approx(128 / 255)
     assert np.abs(image.astype(int) - 128).max() <= 2
 
 

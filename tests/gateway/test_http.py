@@ -225,6 +225,19 @@ def test_depth_comes_as_millimetres_in_a_png(gateway, tracked):
     assert (image.dtype, int(image[0, 0])) == (np.uint16, 1500)
 
 
+@pytest.mark.parametrize(("what", "value"), [("alpha", 255), ("confidence", 128)])
+def test_alpha_and_confidence_come_as_a_grey_png(gateway, tracked, what, value):
+    response = httpx.get(url(gateway, tracked, f"/render?what={what}&format=png"))
+
+    image = cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert (image.dtype, image.shape, int(image[0, 0])) == (np.uint8, (48, 64), value)
+
+
+def test_every_view_tells_how_well_it_is_known(gateway, tracked):
+    assert httpx.get(url(gateway, tracked, "/render")).headers["x-confidence"] == "0.502"
+
+
 @pytest.mark.parametrize(
     ("query", "field"),
     [

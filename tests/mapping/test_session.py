@@ -286,8 +286,11 @@ def test_what_a_former_owner_still_writes_is_no_part_of_the_session(open_session
 def test_the_exported_folder_is_a_session_again(open_session, entry, tmp_path):
     session = open_session()
     session.advance(entry(0))
-    chunk = session.export(ExportRequest(ExportFormat.SNAPSHOT))
-    (tmp_path / "room.tar").write_bytes(chunk.bytes)
+    request = ExportRequest(ExportFormat.SNAPSHOT)
+    pieces = [session.export(request)]
+    while (end := pieces[-1].offset + len(pieces[-1].bytes)) < pieces[-1].total:
+        pieces.append(session.export(replace(request, export=pieces[0].export, offset=end)))
+    (tmp_path / "room.tar").write_bytes(b"".join(piece.bytes for piece in pieces))
     shutil.unpack_archive(tmp_path / "room.tar", tmp_path / "elsewhere", filter="data")
 
     resumed = open_session("elsewhere/room")

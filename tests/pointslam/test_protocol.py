@@ -40,7 +40,8 @@ class SceneMap:
     def render(self, T_world_camera, intrinsics=None, appearance_t_ns=None) -> RenderReply:
         pose = se3.inverse(T_MAP_WORLD) @ T_world_camera
         rgb, depth_m = render_frame(self._scene, pose, self._options, np.random.default_rng(0))
-        return RenderReply(1, rgb, depth_m, np.full(depth_m.shape, 255, np.uint8))
+        opaque = np.full(depth_m.shape, 255, np.uint8)
+        return RenderReply(1, rgb, depth_m, opaque, opaque)
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +98,18 @@ def test_no_truth_means_no_novel_scores(room, lit_scene, room_options, tmp_path)
     scores = score_run(SceneMap(lit_scene, room_options), room, poses, None, output)
 
     assert image_entries(scores, 8)["novel"]["psnr_db"] is None
+
+
+def test_a_perceptual_distance_is_null_unless_one_is_given(
+    evaluation, room, lit_scene, room_options, tmp_path
+):
+    output = EvaluationOutput(tmp_path, 8, lambda done, total: None, lambda *_: 0.25)
+
+    scores = score_run(SceneMap(lit_scene, room_options), room, {0: np.eye(4)}, None, output)
+
+    entries = image_entries(scores, 8)
+    assert (entries["all"]["lpips"], entries["gsicp"]["lpips"]) == (0.25, 0.25)
+    assert image_entries(evaluation[0].images, 8)["all"]["lpips"] is None
 
 
 def full_metrics(evaluation, room):
