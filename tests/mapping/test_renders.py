@@ -80,8 +80,7 @@ def test_renders_beside_the_work_are_those_of_the_map_between_its_steps(
     wrong = [
         moment
         for moment, reply in seen
-        if moment in expected
-        and not all(map(np.array_equal, images(reply), expected[moment]))
+        if moment in expected and not all(map(np.array_equal, images(reply), expected[moment]))
     ]
     assert (wrong, [m for m, _ in seen if m not in expected and m.iterations]) == ([], [])
 
