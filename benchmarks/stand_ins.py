@@ -22,6 +22,7 @@ from shared.maps import (
     Empty,
     ExportChunk,
     ExportRequest,
+    JobState,
     JobStatus,
     MapInfo,
     RefineRequest,
@@ -117,7 +118,7 @@ class _Map:
     request: OpenRequest
     epoch: int
     entries: list[Advance] = field(default_factory=list)
-    refinement: JobStatus = field(default_factory=lambda: JobStatus(False, 0, 0))
+    refinement: JobStatus = field(default_factory=JobStatus)
     stops: list = field(default_factory=list)
 
     def keyframes(self) -> list[Advance]:
@@ -196,6 +197,7 @@ class StandInMapper:
             "render": (RenderRequest, lambda request: _render(known, request)),
             "export": (ExportRequest, _export),
             "refine": (RefineRequest, lambda request: _refine(known, request)),
+            "refinement": (Empty, lambda _: known.refinement),
             "interrupt": (Empty, lambda _: known.refinement),
             "save": (SaveRequest, lambda _: SaveReply(len(known.keyframes()), 1000)),
             "info": (Empty, lambda _: self._info(session, known)),
@@ -253,8 +255,8 @@ def _export(request: ExportRequest) -> ExportChunk:
 
 
 def _refine(known: _Map, request: RefineRequest) -> JobStatus:
-    known.refinement = JobStatus(False, request.iterations, request.iterations)
-    return JobStatus(True, 0, request.iterations)
+    known.refinement = JobStatus(JobState.DONE, request.iterations, request.iterations, 30.0, job=1)
+    return JobStatus(JobState.RUNNING, 0, request.iterations, job=1)
 
 
 def _trajectory(known: _Map) -> Trajectory:

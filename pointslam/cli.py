@@ -1,4 +1,4 @@
-"""The command line: `pointslam run | evaluate | up | synth | export | bench`."""
+"""The command line: `pointslam run | evaluate | up | synth | refine | export | bench`."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluate(commands.add_parser("evaluate", help="score a finished run again"))
     _add_up(commands.add_parser("up", help="start the services and keep them running"))
     _add_synth(commands.add_parser("synth", help="render a procedural room with exact truth"))
+    _add_refine(commands.add_parser("refine", help="optimise a session's map further"))
     _add_export(commands.add_parser("export", help="a run's or a session's map as a file"))
     _add_bench(commands.add_parser("bench", help="measure one part"))
     return parser
@@ -156,6 +157,25 @@ def _synth(arguments: argparse.Namespace) -> None:
     total = options.num_frames + options.num_views
     with progress_bar("rendering", "image") as progress:
         write_sequence(arguments.folder, options, lambda done: progress(done, total))
+
+
+def _add_refine(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("session", metavar="SESSION")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--iterations", type=int, default=0, help="without: watch what is under way")
+    what.add_argument("--interrupt", action="store_true", help="end what is under way")
+    parser.add_argument("--gateway", metavar="URL", default="http://127.0.0.1:8080")
+    parser.set_defaults(command=_refine)
+
+
+def _refine(arguments: argparse.Namespace) -> None:
+    from pointslam.refine import interrupt_session, refine_session
+
+    if arguments.interrupt:
+        job = interrupt_session(arguments.gateway, arguments.session)
+    else:
+        job = refine_session(arguments.gateway, arguments.session, arguments.iterations)
+    _say(f"{job.state} after {job.iterations_done} of {job.iterations_total} iterations")
 
 
 def _add_export(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,7 @@ from pointslam.evaluation.lpips import Lpips
 from pointslam.evaluation.protocol import EvaluationOutput
 from pointslam.launcher import LaunchOptions, Services
 from pointslam.progress import progress_bar
+from pointslam.refine import watch_refinement
 from pointslam.run_folder import RunFolder, RunRecord
 from pointslam.settings import RunSettings, read_settings
 from pointslam.streaming import StreamOptions, StreamResult, stream_sequence
@@ -230,8 +231,8 @@ def _stream_and_map(
     with progress_bar("mapping", "frame") as progress:
         session.wait_until_mapped(progress)
     if options.refine > 0:
-        with progress_bar("refinement") as progress:
-            session.refine(options.refine, progress)
+        session.start_refinement(options.refine)
+        watch_refinement(session)
     session.interrupt()  # a live map would go on optimising while it is saved and scored
     return streamed, _Mapped(session.info(), time.monotonic() - start)
 

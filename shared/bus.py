@@ -51,8 +51,9 @@ class Keys:
         advance (Advance, AdvanceReply), context (ContextRequest, TrackingContext),
         candidates (CandidatesRequest, Candidates), keyframes (Empty, KeyframePoses),
         render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk),
-        refine (RefineRequest, JobStatus), interrupt (Empty, JobStatus), save (SaveRequest,
-        SaveReply), info (Empty, MapInfo), trajectory (TrajectoryRequest, Trajectory).
+        refine (RefineRequest, JobStatus), refinement (Empty, JobStatus), interrupt (Empty,
+        JobStatus), save (SaveRequest, SaveReply), info (Empty, MapInfo),
+        trajectory (TrajectoryRequest, Trajectory).
         """
         return f"{_ROOT}/session/{session}/{epoch}/{question}"
 

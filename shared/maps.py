@@ -80,14 +80,31 @@ class RefineRequest:
     iterations: int
 
 
+class JobState(StrEnum):
+    """What became of a refinement."""
+
+    NONE = "none"  # there was none
+    RUNNING = "running"
+    DONE = "done"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
+
+
 @dataclass(frozen=True)
 class JobStatus:
-    """Progress of a refinement; answered at once, asked again until `is_running` is false."""
+    """The present or the last refinement of a session."""
 
-    is_running: bool
-    iterations_done: int
-    iterations_total: int
+    state: JobState = JobState.NONE
+    iterations_done: int = 0
+    iterations_total: int = 0
+    psnr_db: float | None = None  # running mean over the last training views
     error: str = ""
+    job: int = 0  # counts the refinements of a session
+
+    @property
+    def is_running(self) -> bool:
+        """Whether there is more to come."""
+        return self.state is JobState.RUNNING
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from pointslam.client import calls
+from pointslam.client import calls, refinement
 from pointslam.client.frame_stream import refusal
 from pointslam.client.messages import FrameOptions, frame_message
-from pointslam.client.progress import POLL_S, Progress, pending, refinement
+from pointslam.client.progress import POLL_S, Progress, pending
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import UnavailableError
 from shared.frames import ColourImage, DepthImage
-from shared.maps import ExportFormat, RenderReply
+from shared.maps import ExportFormat, JobStatus, RenderReply
 from shared.stream import FrameMessage, FrameReply
 
 T = TypeVar("T")
@@ -79,6 +79,22 @@ class AsyncClient:
         except httpx.TransportError as error:
             raise self._unreachable(error) from None
         return call.answer(response)
+
+    async def lines(self, path: str) -> AsyncIterator[str]:
+        """The lines of an event stream as they come.
+
+        Raises:
+            PointSlamError: the gateway refused, or the stream broke.
+        """
+        try:
+            async with self._http.stream("GET", path, timeout=calls.SLOW_S) as response:
+                if not response.is_success:
+                    await response.aread()
+                    raise calls.error_from(calls.problem_of(response))
+                async for line in response.aiter_lines():
+                    yield line
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from None
 
     async def download(self, path: str, params: dict[str, str]) -> AsyncIterator[bytes]:
         """A file piece by piece.
@@ -182,15 +198,34 @@ class AsyncSession:
         """State of the map (fields of MapInfo) and of tracking."""
         return await self._client.call(calls.info(self.name))
 
-    async def refine(self, iterations: int, progress: Progress | None = None) -> None:
-        """Optimise the map on all keyframes; returns when done."""
-        await self._client.call(calls.refine(self.name, iterations))
-        is_running = True
-        while is_running:
-            await asyncio.sleep(POLL_S)
-            is_running, done, total = refinement(await self.info())
+    async def refine(self, iterations: int, progress: Progress | None = None) -> JobStatus:
+        """Optimise the map on all keyframes; returns when it is done or interrupted."""
+        job = await self.start_refinement(iterations)
+        async for job in self.refinement_events():
             if progress is not None:
-                progress(done, total)
+                progress(job.iterations_done, job.iterations_total)
+        return refinement.succeeded(job)
+
+    async def start_refinement(self, iterations: int) -> JobStatus:
+        """Start to optimise the map on all keyframes; it goes on without this client."""
+        return await self._client.call(refinement.start(self.name, iterations))
+
+    async def refinement_events(self) -> AsyncIterator[JobStatus]:
+        """The present or the last refinement whenever it has moved, until it has ended."""
+        is_running, path = True, refinement.events_path(self.name)
+        while is_running:
+            try:
+                async for line in self._client.lines(path):
+                    if (job := refinement.job_in(line)) is not None:
+                        is_running = job.is_running
+                        yield job
+            except UnavailableError:
+                await asyncio.sleep(POLL_S)  # the stream broke; perhaps the gateway did not
+                is_running = (await self.refinement()).is_running
+
+    async def refinement(self) -> JobStatus:
+        """The present or the last refinement."""
+        return await self._client.call(refinement.status(self.name))
 
     async def wait_until_mapped(self) -> None:
         """Wait until the map has worked through every answered frame."""
@@ -203,9 +238,9 @@ class AsyncSession:
         async for piece in self._client.download(calls.export_path(self.name), params):
             yield piece
 
-    async def interrupt(self) -> None:
+    async def interrupt(self) -> JobStatus:
         """End a refinement; a live map rests until the next frame."""
-        await self._client.call(calls.interrupt(self.name))
+        return await self._client.call(refinement.interrupt(self.name))
 
     async def save(self) -> dict[str, Any]:
         """Write a snapshot; returns when it is on disk."""

@@ -92,7 +92,7 @@ def error_from(detail: ErrorDetail) -> PointSlamError:
     return _KINDS.get(detail.code, PointSlamError)(text)
 
 
-def _path(session: str, rest: str = "") -> str:
+def path_of(session: str, rest: str = "") -> str:
     return f"/v1/sessions/{quote(session, safe='')}{rest}"
 
 
@@ -134,19 +134,19 @@ def create_session(new: NewSession) -> Call[dict[str, Any]]:
 
 def info(session: str) -> Call[dict[str, Any]]:
     """State of a session."""
-    return Call("GET", _path(session), _json)
+    return Call("GET", path_of(session), _json)
 
 
 def delete(session: str) -> Call[None]:
     """Remove a session."""
-    return Call("DELETE", _path(session), _nothing)
+    return Call("DELETE", path_of(session), _nothing)
 
 
 def track(session: str, message: FrameMessage) -> Call[FrameReply]:
     """Track one frame."""
     return Call(
         "POST",
-        _path(session, "/frames"),
+        path_of(session, "/frames"),
         lambda response: codec.unpack(FrameReply, response.content),
         content=codec.pack(message),
         headers={"Content-Type": "application/msgpack"},
@@ -160,7 +160,7 @@ def pose(session: str, t_ns: int | None) -> Call[NDArray[np.float64]]:
     def read(response: httpx.Response) -> NDArray[np.float64]:
         return codec.from_plain(Pose, response.json()["T_map_camera"]).matrix()
 
-    return Call("GET", _path(session, "/pose"), read, params)
+    return Call("GET", path_of(session, "/pose"), read, params)
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def trajectory(session: str) -> Call[list[TrajectoryRecord]]:
     def read(response: httpx.Response) -> list[TrajectoryRecord]:
         return [_record(plain) for plain in response.json()["records"]]
 
-    return Call("GET", _path(session, "/trajectory"), read)
+    return Call("GET", path_of(session, "/trajectory"), read)
 
 
 def poses_of(records: list[TrajectoryRecord], kind: str) -> list[tuple[int, NDArray[np.float64]]]:
@@ -223,32 +223,22 @@ def render(
     params |= {} if appearance_t_ns is None else {"appearance_t_ns": appearance_t_ns}
     return Call(
         "GET",
-        _path(session, "/render"),
+        path_of(session, "/render"),
         lambda response: codec.unpack(RenderReply, response.content),
         params,
     )
 
 
-def refine(session: str, iterations: int) -> Call[dict[str, Any]]:
-    """Start a refinement; answers its state."""
-    return Call("POST", _path(session, "/refine"), _json, json={"iterations": iterations})
-
-
-def interrupt(session: str) -> Call[dict[str, Any]]:
-    """Stop a refinement."""
-    return Call("POST", _path(session, "/refine/interrupt"), _json)
-
-
 def save(session: str) -> Call[dict[str, Any]]:
     """Write a snapshot."""
-    return Call("POST", _path(session, "/save"), _json, timeout_s=SLOW_S)
+    return Call("POST", path_of(session, "/save"), _json, timeout_s=SLOW_S)
 
 
 def export_path(session: str) -> str:
     """Where the map is fetched as a file."""
-    return _path(session, "/map")
+    return path_of(session, "/map")
 
 
 def stream_url(url: str, session: str) -> str:
     """The WebSocket of a session's frames."""
-    return "ws" + url.removeprefix("http").rstrip("/") + _path(session, "/stream")
+    return "ws" + url.removeprefix("http").rstrip("/") + path_of(session, "/stream")

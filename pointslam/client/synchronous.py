@@ -11,14 +11,14 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from pointslam.client import calls
+from pointslam.client import calls, refinement
 from pointslam.client.frame_stream import stream_frames
 from pointslam.client.messages import FrameOptions, frame_message
-from pointslam.client.progress import POLL_S, Progress, pending, refinement
+from pointslam.client.progress import POLL_S, Progress, pending
 from shared.camera import Calibration, Intrinsics
 from shared.errors import UnavailableError
 from shared.frames import ColourImage, DepthImage
-from shared.maps import ExportFormat, RenderReply
+from shared.maps import ExportFormat, JobStatus, RenderReply
 from shared.stream import FrameMessage, FrameReply
 
 T = TypeVar("T")
@@ -91,6 +91,22 @@ class Client:
         except httpx.TransportError as error:
             raise _unreachable(self.url, error) from None
         return call.answer(response)
+
+    def lines(self, path: str) -> Iterator[str]:
+        """The lines of an event stream as they come.
+
+        Raises:
+            PointSlamError: the gateway refused.
+            UnavailableError: the stream broke.
+        """
+        try:
+            with self._http.stream("GET", path, timeout=calls.SLOW_S) as response:
+                if not response.is_success:
+                    response.read()
+                    raise calls.error_from(calls.problem_of(response))
+                yield from response.iter_lines()
+        except httpx.TransportError as error:
+            raise _unreachable(self.url, error) from None
 
     def download(self, path: str, params: dict[str, str], target: Path) -> None:
         """Fetch a file piece by piece."""
@@ -203,23 +219,49 @@ class Session:
         """State of the map (fields of MapInfo) and of tracking."""
         return self._client.call(calls.info(self.name))
 
-    def refine(self, iterations: int, progress: Progress | None = None) -> None:
-        """Optimise the map on all keyframes; returns when done.
+    def refine(self, iterations: int, progress: Progress | None = None) -> JobStatus:
+        """Optimise the map on all keyframes; returns when it is done or interrupted.
 
         Raises:
             PointSlamError: the refinement failed.
         """
-        self._client.call(calls.refine(self.name, iterations))
-        is_running = True
-        while is_running:
-            time.sleep(POLL_S)
-            is_running, done, total = refinement(self.info())
+        job = self.start_refinement(iterations)
+        for job in self.refinement_events():
             if progress is not None:
-                progress(done, total)
+                progress(job.iterations_done, job.iterations_total)
+        return refinement.succeeded(job)
 
-    def interrupt(self) -> None:
+    def start_refinement(self, iterations: int) -> JobStatus:
+        """Start to optimise the map on all keyframes; it goes on without this client.
+
+        Raises:
+            ConflictError: a refinement is running.
+        """
+        return self._client.call(refinement.start(self.name, iterations))
+
+    def refinement_events(self) -> Iterator[JobStatus]:
+        """The present or the last refinement whenever it has moved, until it has ended.
+
+        Raises:
+            NotFoundError: the session was never refined.
+        """
+        is_running, path = True, refinement.events_path(self.name)
+        while is_running:
+            try:
+                for job in filter(None, map(refinement.job_in, self._client.lines(path))):
+                    is_running = job.is_running
+                    yield job
+            except UnavailableError:
+                time.sleep(POLL_S)  # the stream broke; the call below says whether the gateway did
+                is_running = self._client.call(refinement.status(self.name)).is_running
+
+    def refinement(self) -> JobStatus:
+        """The present or the last refinement."""
+        return self._client.call(refinement.status(self.name))
+
+    def interrupt(self) -> JobStatus:
         """End a refinement; a live map rests until the next frame."""
-        self._client.call(calls.interrupt(self.name))
+        return self._client.call(refinement.interrupt(self.name))
 
     def wait_until_mapped(self, progress: Progress | None = None) -> None:
         """Wait until the map has worked through every answered frame."""

@@ -8,6 +8,7 @@ from services.gateway.body_limit import BodyLimit
 from services.gateway.config import GatewayConfig
 from services.gateway.dispatch import TrackerPool
 from services.gateway.http import http_routes
+from services.gateway.job_http import job_routes
 from services.gateway.map_http import map_routes
 from services.gateway.members import Members
 from services.gateway.metrics import metrics_routes
@@ -40,8 +41,8 @@ def create_app(sessions: Sessions) -> FastAPI:
         description=_DESCRIPTION,
         redoc_url=None,
     )
-    for router in (http_routes(sessions), map_routes(sessions), websocket_routes(sessions)):
-        app.include_router(router)
+    for routes in (http_routes, map_routes, job_routes, websocket_routes):
+        app.include_router(routes(sessions))
     app.include_router(metrics_routes())
     add_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=sessions.fabric.config.limits.max_message_bytes)

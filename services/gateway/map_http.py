@@ -1,33 +1,22 @@
-"""HTTP: views of the map, the map as a file, refinement and snapshots."""
+"""HTTP: views of the map, and the map as a file."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
 from starlette.responses import Response, StreamingResponse
 
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
-from services.gateway.decode import plain
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, mean_confidence, pose_from
-from shared import codec
-from shared.errors import InputError
-from shared.maps import (
-    Empty,
-    ExportFormat,
-    JobStatus,
-    RefineRequest,
-    RenderRequest,
-    SaveReply,
-    SaveRequest,
-)
+from shared.maps import ExportFormat, RenderRequest
 
 _SUFFIXES = {ExportFormat.PLY: "ply", ExportFormat.MESH: "mesh.ply", ExportFormat.SNAPSHOT: "tar"}
 
@@ -75,7 +64,6 @@ def map_routes(sessions: Sessions) -> APIRouter:
     router = APIRouter()
     _add_render_route(router, sessions)
     _add_file_routes(router, sessions)
-    _add_job_routes(router, sessions)
     return router
 
 
@@ -129,39 +117,6 @@ def _add_file_routes(router: APIRouter, sessions: Sessions) -> None:
     async def get_map(name: str, format: ExportFormat) -> Response:
         """The map as a file: splats, a triangle mesh, or a snapshot to resume elsewhere."""
         return await _file(await sessions.get(name), format, sessions.fabric.config)
-
-
-def _add_job_routes(router: APIRouter, sessions: Sessions) -> None:
-    limits = sessions.fabric.config.limits
-    timeout_s = sessions.fabric.config.mapping.question_timeout_s
-
-    @router.post("/v1/sessions/{name}/refine", status_code=202, openapi_extra=examples.REFINE)
-    async def refine(name: str, request: Request) -> dict[str, Any]:
-        """Start to optimise on all keyframes; the session's state shows the progress."""
-        session = await sessions.get(name)
-        try:
-            wanted = plain(RefineRequest, await request.json())
-        except ValueError as error:
-            raise InputError("message", f"not JSON ({str(error)[:200]})") from None
-        if not 0 < wanted.iterations <= limits.max_refine_iterations:
-            raise InputError("iterations", f"must be 1 to {limits.max_refine_iterations}")
-        await session.flush(timeout_s)
-        return codec.to_json(await session.owner.ask("refine", wanted, JobStatus, timeout_s))
-
-    @router.post("/v1/sessions/{name}/refine/interrupt")
-    async def interrupt(name: str) -> dict[str, Any]:
-        """Stop the refinement; what it has done stays."""
-        owner = (await sessions.get(name)).owner
-        return codec.to_json(await owner.ask("interrupt", Empty(), JobStatus, timeout_s))
-
-    @router.post("/v1/sessions/{name}/save")
-    async def save(name: str) -> dict[str, Any]:
-        """Write a snapshot now; answers when it is on disk."""
-        session = await sessions.get(name)
-        await session.flush(timeout_s)
-        export_s = sessions.fabric.config.mapping.export_timeout_s
-        reply = await session.owner.ask("save", SaveRequest(), SaveReply, export_s)
-        return codec.to_json(reply)
 
 
 def _view(session: Session, pose: PoseQuery, camera: CameraQuery, wanted: ViewQuery) -> View:

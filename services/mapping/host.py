@@ -283,6 +283,7 @@ def _answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]
         ("render", RenderRequest, session.render),
         ("export", ExportRequest, session.export),
         ("refine", RefineRequest, session.refine),
+        ("refinement", Empty, lambda _: session.refinement),
         ("interrupt", Empty, lambda _: session.interrupt()),
         ("save", SaveRequest, lambda _: session.save()),
         ("info", Empty, lambda _: session.info()),

@@ -18,7 +18,7 @@ from services.mapping.snapshot import read_newest
 from services.mapping.storage import SessionFolder, SessionRecord
 from shared.errors import ConflictError
 from shared.frames import Frame
-from shared.maps import Trajectory
+from shared.maps import JobStatus, Trajectory
 from shared.tracks import (
     Advance,
     Candidates,
@@ -43,6 +43,7 @@ class Resumed:
     """What the map must take up: a snapshot, and the entries behind it."""
 
     map: MapState | None = None
+    refinement: JobStatus = JobStatus()
     frames: dict[int, Frame] = field(default_factory=dict)  # keyframes of the snapshot
     later: list[NewKeyframe | None] = field(default_factory=list)
 
@@ -64,8 +65,9 @@ class Ledger:
     ) -> Resumed:
         """Read the newest snapshot and every older epoch's log."""
         snapshot = read_newest(folder.path)
-        resumed = Resumed(snapshot.map if snapshot else None)
+        resumed = Resumed()
         if snapshot:
+            resumed = Resumed(snapshot.map, snapshot.refinement)
             self._store = KeyframeStore.from_state(snapshot.keyframes, config)
         for name in sorted(log_ends):
             for entry in read_log(folder.path / name, log_ends[name]):

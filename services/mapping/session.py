@@ -19,6 +19,7 @@ from services.mapping.ledger import Ledger, Resumed
 from services.mapping.mesh import export_mesh
 from services.mapping.metrics import SNAPSHOT_SECONDS
 from services.mapping.pipeline import Mapper
+from services.mapping.refinement import Refinement
 from services.mapping.renders import Renders
 from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
@@ -65,7 +66,8 @@ class Session:
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._renders = Renders(mapper, self.record.epoch, config.render)
-        self._worker = MapWorker(mapper, self.record.mode, config)
+        refinement = Refinement(folder.path, self.ledger.resumed.refinement)
+        self._worker = MapWorker(mapper, refinement, self.record.mode, config)
         self._take_up(mapper)
         self._calm = threading.Lock()  # held while a snapshot wants no new entries
         self._saving = threading.Lock()
@@ -96,7 +98,7 @@ class Session:
     @property
     def is_working(self) -> bool:
         """Whether entries wait for the map or a refinement runs."""
-        return self._worker.pending > 0 or self._worker.job.is_running
+        return self._worker.pending > 0 or self.refinement.is_running
 
     def opening(self) -> OpenReply:
         """What whoever opens the session is told."""
@@ -168,8 +170,18 @@ class Session:
             return spooled(export_mesh(self._worker.visit), path)
         return spooled(self._worker.visit(export_ply), path)
 
+    @property
+    def refinement(self) -> JobStatus:
+        """The present or the last refinement."""
+        return self._worker.refinement.status
+
     def refine(self, request: RefineRequest) -> JobStatus:
-        """Start a refinement over all keyframes."""
+        """Start a refinement over all keyframes.
+
+        Raises:
+            ConflictError: one is running.
+            StorageError: the disk refused.
+        """
         return self._worker.refine(request.iterations)
 
     def interrupt(self) -> JobStatus:
@@ -188,8 +200,8 @@ class Session:
                 self._worker.drain()
                 capture = self.ledger.capture()
                 revision = self.ledger.revision
-                state = self._worker.visit(lambda mapper: mapper.state())
-            snapshot = Snapshot(capture.entries, state, capture.keyframes)
+                state, job = self._worker.visit(lambda mapper: (mapper.state(), self.refinement))
+            snapshot = Snapshot(capture.entries, state, capture.keyframes, job)
             with SNAPSHOT_SECONDS.time():
                 size = write_snapshot(self._folder.path, snapshot, self._lease.check)
             self._saved = capture.entries, state.values["iterations"]
@@ -211,7 +223,7 @@ class Session:
             landmarks=ledger.num_landmarks,
             loops=ledger.num_loops,
             pending=self._worker.pending,
-            refinement=self._worker.job,
+            refinement=self.refinement,
             stages_ms=stages,
             iteration_ms=stages.get("iteration"),
             mapping_s=times.mapping_s,

@@ -22,7 +22,9 @@ import safetensors.torch
 
 from services.mapping.map_state import MapState
 from services.mapping.storage import storage_errors, sync_folder
+from shared import codec
 from shared.errors import StorageError
+from shared.maps import JobStatus
 
 LOGGER = logging.getLogger(__name__)
 _KEPT = 2
@@ -41,6 +43,7 @@ class Snapshot:
     entries: int
     map: MapState
     keyframes: Mapping[str, np.ndarray]  # of the KeyframeStore
+    refinement: JobStatus = JobStatus()  # how far it was when the map was so
 
 
 def write_snapshot(
@@ -98,6 +101,7 @@ def _write_files(folder: Path, snapshot: Snapshot) -> int:
     keyframes = {name: np.ascontiguousarray(a) for name, a in snapshot.keyframes.items()}
     safetensors.numpy.save_file(keyframes, folder / _KEYFRAMES)
     values = {"entries": snapshot.entries, "map": snapshot.map.values}
+    values["refinement"] = codec.to_json(snapshot.refinement)
     (folder / _VALUES).write_text(json.dumps(values))
     checksums = {name: _checksum(folder / name) for name in (_MAP, _KEYFRAMES, _VALUES)}
     (folder / _MANIFEST).write_text(json.dumps(checksums))
@@ -122,4 +126,5 @@ def _read(folder: Path) -> Snapshot:
         entries=values["entries"],
         map=MapState(safetensors.torch.load_file(folder / _MAP), values["map"]),
         keyframes=safetensors.numpy.load_file(folder / _KEYFRAMES),
+        refinement=codec.from_plain(JobStatus, values["refinement"]),
     )

@@ -12,13 +12,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 from services.mapping.config import MappingConfig
 from services.mapping.pipeline import Mapper, NewKeyframe
+from services.mapping.refinement import Refinement
 from services.mapping.turns import Turns
-from shared.errors import ConflictError, UnavailableError
+from shared.errors import UnavailableError
 from shared.maps import JobStatus
 
 LOGGER = logging.getLogger(__name__)
@@ -37,7 +38,9 @@ class WorkTimes:
 class MapWorker:
     """Owns a session's mapper and the queue of what it has yet to see."""
 
-    def __init__(self, mapper: Mapper, mode: str, config: MappingConfig) -> None:
+    def __init__(
+        self, mapper: Mapper, refinement: Refinement, mode: str, config: MappingConfig
+    ) -> None:
         self._mapper = mapper
         self._is_live = mode == LIVE
         self._config = config
@@ -47,7 +50,7 @@ class MapWorker:
         self._is_busy = False
         self._is_stopping = False
         self._last_entry_s = -math.inf  # a map that was taken up stays as it was until one comes
-        self._job = JobStatus(is_running=False, iterations_done=0, iterations_total=0)
+        self.refinement = refinement
         self.times = WorkTimes()
         self._thread = threading.Thread(target=self._run, name="map-worker", daemon=True)
 
@@ -69,11 +72,6 @@ class MapWorker:
     def iterations(self) -> int:
         """Iterations done on the map so far."""
         return self._mapper.iterations
-
-    @property
-    def job(self) -> JobStatus:
-        """The present or the last refinement."""
-        return self._job
 
     def submit(self, keyframe: NewKeyframe | None) -> None:
         """Queue the map's share of one log entry."""
@@ -108,20 +106,18 @@ class MapWorker:
 
         Raises:
             ConflictError: one is running.
+            StorageError: the disk refused.
         """
+        status = self.refinement.start(iterations)
         with self._changed:
-            if self._job.is_running:
-                raise ConflictError("a refinement is running; interrupt it first")
-            self._job = JobStatus(iterations > 0, 0, iterations)
             self._changed.notify_all()
-            return self._job
+        return status
 
     def interrupt(self) -> JobStatus:
         """End a refinement after its present iteration; a live map rests until an entry comes."""
         with self._changed:
             self._last_entry_s = -math.inf
-            self._job = replace(self._job, is_running=False)
-            return self._job
+        return self.refinement.interrupt()
 
     def stop(self) -> None:
         """Finish the present step and end the thread; what is queued stays undone."""
@@ -141,7 +137,7 @@ class MapWorker:
                 step()
             except Exception as error:  # the thread must outlive a keyframe that makes no sense
                 LOGGER.exception("a step of the map failed")
-                self._fail(error)
+                self.refinement.fail(str(error))
             with self._changed:
                 self._is_busy = False
                 self._changed.notify_all()
@@ -154,7 +150,7 @@ class MapWorker:
                     self._is_busy = True
                     keyframe = self._queue.popleft()
                     return lambda: self._work_through(keyframe)
-                if self._job.is_running:
+                if self.refinement.status.is_running:
                     return self._refine_once
                 idle_s = time.monotonic() - self._last_entry_s
                 if self._is_live and idle_s < self._config.owner.live_idle_s:
@@ -185,20 +181,13 @@ class MapWorker:
 
     def _wait_for_entry(self) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._is_stopping or self._job.is_running)
+            self._changed.wait_for(
+                lambda: self._queue or self._is_stopping or self.refinement.status.is_running
+            )
 
     def _refine_once(self) -> None:
-        start = time.monotonic()
-        job = self._job
-        with self._turns.step():
+        start, job = time.monotonic(), self.refinement.status
+        with self._turns.step():  # a snapshot finds the map and the count of one moment
             self._mapper.refine(job.iterations_done / job.iterations_total)
+            self.refinement.count(self._mapper.psnr_db)
         self.times.refinement_s += time.monotonic() - start
-        with self._changed:
-            done = job.iterations_done + 1
-            is_running = self._job.is_running and done < job.iterations_total
-            self._job = replace(self._job, is_running=is_running, iterations_done=done)
-
-    def _fail(self, error: Exception) -> None:
-        with self._changed:
-            if self._job.is_running:
-                self._job = replace(self._job, is_running=False, error=str(error))

@@ -279,6 +279,27 @@ def test_refinement_and_saving_go_to_the_maps_owner(tracked):
     assert tracked.save()["revision"] == 2
 
 
+def test_a_refinement_is_a_job_with_a_place_and_events(gateway, tracked):
+    path = url(gateway, tracked, "/refine")
+
+    started = httpx.post(path, json={"iterations": 50})
+    events = httpx.get(path + "/events")
+
+    assert (started.status_code, started.json()["state"]) == (202, "running")
+    assert path.endswith(started.headers["location"])
+    assert events.headers["content-type"].startswith("text/event-stream")
+    assert events.text.startswith("event: end\ndata: {")
+    assert httpx.get(path).json()["iterations_done"] == 50
+    assert httpx.delete(path).json()["state"] == "done"
+
+
+def test_a_session_that_was_never_refined_has_no_events(gateway, tracked):
+    path = url(gateway, tracked, "/refine")
+
+    assert httpx.get(path + "/events").status_code == 404
+    assert httpx.get(path).json()["state"] == "none"
+
+
 def test_a_refinement_of_no_iterations_is_refused(tracked):
     with pytest.raises(InputError, match="iterations"):
         tracked.refine(0)

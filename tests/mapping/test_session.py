@@ -18,7 +18,7 @@ from services.mapping.storage import SessionFolder, SessionRecord, read_record
 from services.mapping.tenure import Lease
 from shared import se3
 from shared.errors import ConflictError, GoneError, InputError, UnavailableError
-from shared.maps import ExportFormat, ExportRequest, RefineRequest, RenderRequest
+from shared.maps import ExportFormat, ExportRequest, JobState, RefineRequest, RenderRequest
 from shared.tracks import ContextRequest
 
 CONFIG = MappingConfig(owner=OwnerConfig(max_pending=2))
@@ -193,10 +193,70 @@ def test_a_refinement_runs_to_its_end_and_says_so(open_session, entry):
     session.advance(entry(0))
 
     session.refine(RefineRequest(3))
-    while session.info().refinement.is_running:
+    while session.refinement.is_running:
         os.sched_yield()
 
-    assert session.info().refinement.iterations_done == 3
+    assert session.refinement.state is JobState.DONE
+    assert (session.refinement.iterations_done, session.refinement.job) == (3, 1)
+    assert session.refinement.psnr_db == session.info().psnr_db
+
+
+def test_a_refinement_goes_on_from_the_snapshot_when_its_owner_is_gone(
+    open_session, entry, tmp_path
+):
+    whole = open_session("whole")
+    whole.advance(entry(0))
+    refined(whole, 12)
+    killed = open_session("killed")
+    killed.advance(entry(0))
+    killed.refine(RefineRequest(12))
+    while killed.refinement.iterations_done < 3:
+        os.sched_yield()
+    killed.save()
+    shutil.copytree(tmp_path / "killed", tmp_path / "resumed")
+
+    resumed = open_session("resumed")
+    while resumed.refinement.is_running:
+        os.sched_yield()
+
+    assert resumed.refinement.iterations_done == 12
+    expected, found = parameters(whole), parameters(resumed)
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+
+
+def test_a_refinement_without_a_snapshot_starts_again(open_session, entry, tmp_path):
+    session = open_session()
+    session.advance(entry(0))
+    session.refine(RefineRequest(10_000))
+    shutil.copytree(tmp_path / "room", tmp_path / "copy")
+
+    resumed = open_session("copy")
+
+    assert (resumed.refinement.state, resumed.refinement.job) == (JobState.RUNNING, 1)
+    assert resumed.refinement.iterations_total == 10_000
+
+
+def test_an_interrupted_refinement_stays_so_and_tells_what_was_done(open_session, entry, tmp_path):
+    session = open_session()
+    session.advance(entry(0))
+    session.refine(RefineRequest(10_000))
+    while session.refinement.iterations_done < 2:
+        os.sched_yield()
+    interrupted = session.interrupt()
+    shutil.copytree(tmp_path / "room", tmp_path / "copy")
+
+    resumed = open_session("copy")
+
+    assert interrupted.state is resumed.refinement.state is JobState.INTERRUPTED
+    assert 2 <= interrupted.iterations_done == resumed.refinement.iterations_done
+    refined(resumed, 1)
+    assert resumed.refinement.job == 2
+
+
+def refined(session: Session, iterations: int) -> None:
+    session.refine(RefineRequest(iterations))
+    while session.refinement.is_running:
+        os.sched_yield()
 
 
 def test_a_second_refinement_is_refused_while_one_runs(open_session, entry):
