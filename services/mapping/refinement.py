@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,12 +25,16 @@ _FILE = "refinement.msgpack"
 class Refinement:
     """The present or the last refinement of a session; safe from any thread."""
 
-    def __init__(self, folder: Path, saved: JobStatus) -> None:
+    def __init__(
+        self, folder: Path, saved: JobStatus, check_owner: Callable[[], None] = lambda: None
+    ) -> None:
         """Take up what a session's folder says.
 
         Args:
             saved: the refinement of the snapshot that the map is taken up from.
+            check_owner: raises before the folder is written to if it is another owner's by now.
         """
+        self._check_owner = check_owner
         self._path = folder / _FILE
         self._lock = threading.Lock()
         self._status = _taken_up(self._path, saved)
@@ -44,7 +49,7 @@ class Refinement:
 
         Raises:
             ConflictError: one is running.
-            StorageError: the disk refused; there is no new one.
+            GoneError, StorageError: it could not be written; there is no new one.
         """
         with self._lock:
             if self._status.is_running:
@@ -82,6 +87,7 @@ class Refinement:
             self._status = ended
 
     def _set(self, status: JobStatus) -> None:
+        self._check_owner()
         write_atomically(self._path, codec.pack(status))
         self._status = status
 

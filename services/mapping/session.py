@@ -66,7 +66,7 @@ class Session:
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._renders = Renders(mapper, self.record.epoch, config.render)
-        refinement = Refinement(folder.path, self.ledger.resumed.refinement)
+        refinement = Refinement(folder.path, self.ledger.resumed.refinement, lease.check)
         self._worker = MapWorker(mapper, refinement, self.record.mode, config)
         self._take_up(mapper)
         self._calm = threading.Lock()  # held while a snapshot wants no new entries
