@@ -135,6 +135,13 @@ class AnchorMap:
         offsets = self.rows["offsets"][index].view(len(index), -1, 3) * sizes
         self.rows["offsets"][index] = ((offsets @ R.T) / sizes).view(len(index), -1)
 
+    def copy(self) -> AnchorMap:
+        """What drawing needs of them, as it is now; without optimizer state and statistics."""
+        drawn = {"position", "scalings", "creator", "gate", *trained_widths(self.config)}
+        copied = AnchorMap(self.config, self.device, self.is_gated)
+        copied.rows = self.rows.copy(drawn)
+        return copied
+
     def state(self) -> dict[str, Tensor]:
         """All rows, for a snapshot."""
         return self.rows.state()

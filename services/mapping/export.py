@@ -8,64 +8,40 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from services.mapping.pipeline import Mapper
-from services.mapping.rasterizer import Gaussians
+from services.mapping.baking import BakedGaussians
 from services.mapping.snapshot import snapshot_folders
 from services.mapping.storage import storage_errors
 
-SH_DC = 0.28209479177387814  # the constant basis function: colour = 0.5 + SH_DC * f_dc
-MIN_OPACITY = 1.0 / 255.0
 _PACKED = (".msgpack", ".bin")
-_PROPERTIES = (
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_FIRST = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+_LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
-def export_ply(mapper: Mapper) -> bytes:
-    """The map's Gaussians, each as the keyframe that made its anchor sees it, as a 3DGS PLY.
+def ply_bytes(baked: BakedGaussians) -> bytes:
+    """Gaussians in the binary PLY that splat viewers read.
 
-    Spherical harmonics of degree 0; opacity as a logit, scales as logarithms, quaternions wxyz.
+    Opacity as a logit, scales as logarithms, quaternions wxyz, coefficients of one colour after
+    those of another.
     """
-    return ply_bytes(bake(mapper))
-
-
-@torch.no_grad()
-def bake(mapper: Mapper) -> Gaussians:
-    """All Gaussians that show, decoded for the views of their anchors' keyframes."""
-    creators = mapper.anchors.rows["creator"]
-    parts = []
-    for seq in creators.unique().tolist():
-        index = (creators == seq).nonzero()[:, 0]
-        centre = torch.from_numpy(mapper.views[seq].T_world_camera[:3, 3])
-        centre = centre.to(mapper.anchors.rows["position"])
-        parts.append(mapper.painter.gaussians(index, centre)[1])
-    joined = [torch.cat(tensors) for tensors in zip(*(p.tensors() for p in parts), strict=True)]
-    if not joined:
-        return Gaussians(*(torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (3,))))
-    shows = joined[3] > MIN_OPACITY
-    return Gaussians(*(tensor[shows] for tensor in joined))
-
-
-def ply_bytes(gaussians: Gaussians) -> bytes:
-    """Gaussians in the binary PLY that splat viewers read."""
-    means, scales, quats, opacities, colours = (
-        tensor.detach().cpu().numpy() for tensor in gaussians.tensors()
+    means, scales, quats, opacities, _ = (
+        tensor.detach().cpu().numpy() for tensor in baked.gaussians.tensors()
     )
+    harmonics = baked.harmonics.cpu().numpy()
     opacities = opacities.clip(1e-6, 1.0 - 1e-6)[:, None]
     columns: list[NDArray] = [
         means,
         np.zeros_like(means),
-        (colours - 0.5) / SH_DC,
+        harmonics[:, 0],
+        harmonics[:, 1:].transpose(0, 2, 1).reshape(len(means), -1),
         np.log(opacities / (1.0 - opacities)),
         np.log(scales.clip(1e-9)),
         quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-12),
     ]
+    rest = [f"f_rest_{i}" for i in range(3 * (harmonics.shape[1] - 1))]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
-    header += [f"property float {name}" for name in _PROPERTIES]
+    header += [f"property float {name}" for name in (*_FIRST, *rest, *_LAST)]
     text = "\n".join([*header, "end_header", ""])
     return text.encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
 

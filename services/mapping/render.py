@@ -41,8 +41,9 @@ class Painter:
 
     def decode(self, view: View, is_trained: bool) -> tuple[Visible, Gaussians]:
         """The Gaussians of the anchors in a view (Eq. 4 to 6)."""
-        index = visible_index(self.anchors, view, self.config.max_visible_anchors)
-        camera = torch.from_numpy(camera_world(view)).to(self.anchors.rows["position"])
+        positions = self.anchors.rows["position"]
+        index = visible_index(positions, view, self.config.max_visible_anchors)
+        camera = torch.from_numpy(camera_world(view)).to(positions)
         return self.gaussians(index, camera, is_trained)
 
     def gaussians(
@@ -68,10 +69,10 @@ def camera_world(view: View) -> np.ndarray:
     return -T[:3, :3].T @ T[:3, 3]
 
 
-def visible_index(anchors: AnchorMap, view: View, limit: int) -> Tensor:
-    """Rows of the anchors inside a view, ascending; the nearest `limit` if there are more."""
-    T = torch.from_numpy(np.asarray(view.T_camera_world)).to(anchors.rows["position"])
-    points = anchors.rows["position"] @ T[:3, :3].T + T[:3, 3]
+def visible_index(positions: Tensor, view: View, limit: int) -> Tensor:
+    """Which of `positions` [N, 3] are inside a view, ascending; the nearest `limit` at most."""
+    T = torch.from_numpy(np.asarray(view.T_camera_world)).to(positions)
+    points = positions @ T[:3, :3].T + T[:3, 3]
     depth = points[:, 2].clamp_min(1e-6)
     k = view.intrinsics
     u = points[:, 0] / depth * k.fx + k.cx

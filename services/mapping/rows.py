@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import Tensor
@@ -43,6 +43,13 @@ class RowTable:
             kept = column[: self._size][is_kept]
             self._columns[name][: len(kept)] = kept
         self._size = int(is_kept.sum())
+
+    def copy(self, names: Collection[str]) -> RowTable:
+        """A table of its own with those of the columns `names` that there are."""
+        copied = RowTable({}, self._device)
+        copied._columns = {n: self[n].clone() for n in self._columns if n in names}
+        copied._size = self._size
+        return copied
 
     def state(self) -> dict[str, Tensor]:
         """Every column, copied to the host."""

@@ -11,8 +11,9 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
+from services.mapping.baking import MapCopy, bake
 from services.mapping.config import MappingConfig
-from services.mapping.export import export_ply, pack_folder, spooled
+from services.mapping.export import pack_folder, ply_bytes, spooled
 from services.mapping.exports import Exports
 from services.mapping.figures import MapFigures
 from services.mapping.ledger import Ledger, Resumed
@@ -168,7 +169,8 @@ class Session:
                 return pack_folder(path)
         if format is ExportFormat.MESH:
             return spooled(export_mesh(self._worker.visit), path)
-        return spooled(self._worker.visit(export_ply), path)
+        copied = self._worker.visit(MapCopy.of)
+        return spooled(ply_bytes(bake(copied, self._surroundings.config.export)), path)
 
     @property
     def refinement(self) -> JobStatus:

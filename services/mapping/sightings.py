@@ -67,11 +67,12 @@ class Sightings:
     def __init__(self, calibration: Calibration) -> None:
         self._calibration = calibration
         self._depths_mm: dict[int, NDArray[np.uint16]] = {}
-        self._step, self._camera = 1, calibration.colour.intrinsics
+        self._step = 1
+        self.camera = calibration.colour.intrinsics  # of the keyframes' rectified images
 
     def add(self, seq: int, image: RgbdImage) -> None:
         """Keep what a keyframe measured."""
-        self._camera = image.intrinsics
+        self.camera = image.intrinsics
         self._step = _step_of(image.intrinsics)
         coarse = image.depth_m[_grid(self._step)] * _MILLIMETRES
         self._depths_mm[seq] = np.clip(coarse, 0, 65535).astype(np.uint16)
@@ -97,6 +98,14 @@ class Sightings:
         alpha = drawn.alpha.astype(np.float32) / np.float32(255.0)
         return np.rint(255.0 * alpha * alpha * smooth).astype(np.uint8)
 
+    def agreement(
+        self, points_world: NDArray[np.float32], keyframe: TrainingView
+    ) -> NDArray[np.float32]:
+        """Whether a keyframe measured a surface at points [P, 3] that it looks at, 0 to 1, [P]."""
+        is_drawn, centre = np.ones(len(points_world), bool), keyframe.T_world_camera[:3, 3]
+        points = _Points(points_world.astype(np.float64), is_drawn, centre.copy())
+        return self._weights(points, [keyframe])[0]
+
     def _best_keyframes(
         self, points: _Points, shape: tuple[int, ...], keyframes: list[TrainingView]
     ) -> list[TrainingView]:
@@ -114,7 +123,7 @@ class Sightings:
         """How well each keyframe saw each point, 0 to 1, [K, P]."""
         depths = np.stack([self._depth_mm(keyframe) for keyframe in keyframes])
         T = np.stack([se3.inverse(keyframe.T_world_camera) for keyframe in keyframes])
-        k, weights = self._camera, np.zeros((len(keyframes), len(points.world)), np.float32)
+        k, weights = self.camera, np.zeros((len(keyframes), len(points.world)), np.float32)
         camera = np.array([k.fx, k.fy, k.cx, k.cy, self._step], np.float64)
         weigh(
             (points.world, points.is_drawn, points.camera_world),

@@ -8,22 +8,24 @@ import numpy as np
 import pytest
 import torch
 
+from services.mapping.baking import BakedGaussians
 from services.mapping.export import ply_bytes
 from services.mapping.exports import MAX_OPEN, Exports
 from services.mapping.rasterizer import Gaussians
 from shared.errors import NotFoundError
 
 
-def gaussians(count: int = 4) -> Gaussians:
+def baked(count: int = 4, degree: int = 0) -> BakedGaussians:
     generator = torch.Generator().manual_seed(0)
-    quats = torch.randn(count, 4, generator=generator)
-    return Gaussians(
+    gaussians = Gaussians(
         means=torch.randn(count, 3, generator=generator),
         scales=torch.rand(count, 3, generator=generator) + 0.01,
-        quats_wxyz=quats,
+        quats_wxyz=torch.randn(count, 4, generator=generator),
         opacities=torch.linspace(0.1, 0.9, count),
         colours=torch.rand(count, 3, generator=generator),
     )
+    harmonics = 0.1 * torch.randn(count, (degree + 1) ** 2, 3, generator=generator)
+    return BakedGaussians(gaussians, harmonics)
 
 
 def read_ply(data: bytes) -> np.ndarray:
@@ -37,33 +39,56 @@ def read_ply(data: bytes) -> np.ndarray:
     return vertices
 
 
-def test_a_ply_holds_what_3dgs_viewers_expect():
-    vertices = read_ply(ply_bytes(gaussians()))
+@pytest.mark.parametrize(("degree", "rest"), [(0, 0), (1, 9), (2, 24), (3, 45)])
+def test_a_ply_holds_what_3dgs_viewers_expect(degree, rest):
+    vertices = read_ply(ply_bytes(baked(degree=degree)))
 
     assert vertices.dtype.names == (
-        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-        *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     )
 
 
 def test_a_viewer_computes_the_maps_values_from_the_ply():
-    expected = gaussians()
+    expected = baked().gaussians
 
-    vertices = read_ply(ply_bytes(expected))
+    vertices = read_ply(ply_bytes(baked()))
 
-    stack = lambda *names: np.stack([vertices[name] for name in names], axis=1)  # noqa: E731
-    colours = 0.5 + 0.28209479 * stack("f_dc_0", "f_dc_1", "f_dc_2")
-    scales = np.exp(stack("scale_0", "scale_1", "scale_2"))
+    scales = np.exp(columns(vertices, "scale_0", "scale_1", "scale_2"))
     quats = expected.quats_wxyz / expected.quats_wxyz.norm(dim=1, keepdim=True)
-    np.testing.assert_allclose(stack("x", "y", "z"), expected.means)
-    np.testing.assert_allclose(colours, expected.colours, atol=1e-6)
+    found = columns(vertices, "rot_0", "rot_1", "rot_2", "rot_3")
+    np.testing.assert_allclose(columns(vertices, "x", "y", "z"), expected.means)
     np.testing.assert_allclose(scales, expected.scales, rtol=1e-5)
     np.testing.assert_allclose(1 / (1 + np.exp(-vertices["opacity"])), expected.opacities, 1e-5)
-    np.testing.assert_allclose(stack("rot_0", "rot_1", "rot_2", "rot_3"), quats, atol=1e-6)
+    np.testing.assert_allclose(found, quats, atol=1e-6)
+
+
+def test_a_viewer_computes_the_colours_of_a_direction_from_the_ply():
+    x, y, z = direction = np.array([0.48, -0.6, 0.64])
+    expected = baked(degree=1)
+    camera = expected.gaussians.means[2] - 3.0 * torch.from_numpy(direction).float()
+
+    vertex = read_ply(ply_bytes(expected))[2]
+
+    # As the viewers' shaders spell it: a constant, then three functions, colour by colour.
+    colour = [
+        0.5
+        + 0.28209479177387814 * vertex[f"f_dc_{c}"]
+        - 0.4886025119029199 * y * vertex[f"f_rest_{3 * c}"]
+        + 0.4886025119029199 * z * vertex[f"f_rest_{3 * c + 1}"]
+        - 0.4886025119029199 * x * vertex[f"f_rest_{3 * c + 2}"]
+        for c in range(3)
+    ]
+    np.testing.assert_allclose(expected.seen_from(camera).colours[2], colour, atol=1e-6)
+
+
+def columns(vertices: np.ndarray, *names: str) -> np.ndarray:
+    return np.stack([vertices[name] for name in names], axis=1)
 
 
 def test_a_map_of_nothing_is_a_ply_without_vertices():
-    assert len(read_ply(ply_bytes(gaussians(0)))) == 0
+    assert len(read_ply(ply_bytes(baked(0)))) == 0
 
 
 def test_pieces_join_to_the_file_which_is_closed_then():

@@ -9,10 +9,17 @@ import pytest
 import torch
 
 from services.mapping import densification
-from services.mapping.config import AnchorConfig, DensificationConfig, MappingConfig, ScheduleConfig
-from services.mapping.export import bake
+from services.mapping.baking import MapCopy, bake
+from services.mapping.config import (
+    AnchorConfig,
+    DensificationConfig,
+    ExportConfig,
+    MappingConfig,
+    ScheduleConfig,
+)
 from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
+from services.mapping.rasterizer import View
 from shared import se3
 from shared.errors import InputError
 from shared.maps import RenderRequest
@@ -260,14 +267,42 @@ def test_a_baked_map_holds_only_gaussians_that_show(mapper, insert):
     insert(mapper, 0)
     mapper.iterate(10)
 
-    gaussians = bake(mapper)
+    found = bake(MapCopy.of(mapper), ExportConfig())
 
-    assert 0 < len(gaussians.means) <= 5 * len(mapper.anchors)
-    assert gaussians.opacities.min() > 1 / 255
+    assert 0 < len(found.gaussians.means) <= 5 * len(mapper.anchors)
+    assert found.gaussians.opacities.min() > 1 / 255
+    assert found.harmonics.shape[1:] == (16, 3)
 
 
 def test_a_map_without_keyframes_bakes_to_nothing(mapper):
-    assert len(bake(mapper).means) == 0
+    assert len(bake(MapCopy.of(mapper), ExportConfig()).gaussians.means) == 0
+
+
+def test_a_copy_for_baking_is_not_touched_by_the_optimisation(mapper, insert):
+    insert(mapper, 0)
+    mapper.iterate(5)
+    before = bake(copy := MapCopy.of(mapper), ExportConfig())
+
+    mapper.iterate(5)
+
+    assert torch.equal(before.harmonics, bake(copy, ExportConfig()).harmonics)
+
+
+def test_baked_harmonics_come_nearer_to_the_map_than_a_single_colour(
+    mapper, insert, calibration, true_pose
+):
+    for seq in (0, 4, 8, 12, 16):
+        insert(mapper, seq)
+        mapper.iterate(30)
+    view = View(se3.inverse(true_pose(6)), calibration.colour.intrinsics)
+    expected = mapper.painter.draw(view).rendered.colour
+    copy, camera = MapCopy.of(mapper), torch.from_numpy(true_pose(6)[:3, 3]).float()
+
+    def error(degree: int) -> float:
+        seen = bake(copy, ExportConfig(harmonics_degree=degree)).seen_from(camera)
+        return float((mapper.painter.rasterizer(seen, view).colour - expected).square().mean())
+
+    assert error(3) < 0.8 * error(0)
 
 
 def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose):
