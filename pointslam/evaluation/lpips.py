@@ -138,7 +138,7 @@ def maximum_pool(images: Images, size: int) -> Images:
     kernel = np.ones((size, size), np.uint8)
     highest = np.stack([cv2.dilate(plane, kernel, anchor=(0, 0)) for plane in flat])
     pooled = highest[:, : 2 * height : 2, : 2 * width : 2]
-    return pooled.reshape(*images.shape[:2], height, width)
+    return pooled.reshape(*images.shape[:2], height, width).astype(np.float32, copy=False)
 
 
 def _network_of(weights: Mapping[str, NDArray]) -> str:

@@ -44,6 +44,12 @@ class NewAnchors:
         """The rows of `index`."""
         return NewAnchors(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
+    def finite(self) -> NewAnchors:
+        """Those whose every number is one."""
+        columns = (self.positions, self.features, self.offsets, self.scalings)
+        is_finite = [np.isfinite(column).all(axis=1) for column in columns]
+        return self.take(np.flatnonzero(np.logical_and.reduce(is_finite)))
+
     def first(self, count: int) -> NewAnchors:
         """At most `count` of them, primary ones first."""
         return self.take(np.argsort(~self.is_primary, kind="stable")[:count])
@@ -92,8 +98,11 @@ class AnchorMap:
         return sizes + self.rows["sizes"][index].view(len(index), -1, 3).mean(1)
 
     def append(self, new: NewAnchors, creator_seq: int) -> int:
-        """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many."""
-        new = new.first(max(0, self.config.max_anchors - len(self)))
+        """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many.
+
+        Those that are not finite (a fault of a pose or a landmark) are left out.
+        """
+        new = new.finite().first(max(0, self.config.max_anchors - len(self)))
         if len(new) == 0:
             return 0
         is_primary = torch.from_numpy(new.is_primary)
@@ -142,9 +151,9 @@ class AnchorMap:
         copied.rows = self.rows.copy(drawn)
         return copied
 
-    def state(self) -> dict[str, Tensor]:
-        """All rows, for a snapshot."""
-        return self.rows.state()
+    def state(self, room: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+        """All rows, for a snapshot; `room` is that of `rows.room()`."""
+        return self.rows.state(room)
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Replace all rows."""

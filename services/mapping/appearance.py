@@ -52,8 +52,8 @@ class ExposureModel:
         return np.array(mixed, np.float32).reshape(2, 3)
 
     def step(self, seq: int, gradient: NDArray[np.float32], rate: float) -> None:
-        """One step of Adam for a keyframe's exposure; `gradient` is [2, 3]."""
-        if seq == next(iter(self._rows)):
+        """One step of Adam for a keyframe's exposure; `gradient` is [2, 3], finite or ignored."""
+        if seq == next(iter(self._rows)) or not np.isfinite(gradient).all():
             return
         self._steps[seq] += 1
         value, mean, square = self._rows[seq]

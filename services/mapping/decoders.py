@@ -19,6 +19,7 @@ from services.mapping.decoder import (
 )
 from services.mapping.decoder_cpu import decode_cpu
 from services.mapping.map_state import restore_moments, weight_moments
+from services.mapping.optimizer import drop_faults
 from services.mapping.plain_decoder import PlainAnchors, decode_plain
 from services.mapping.rasterizer import Gaussians
 
@@ -89,6 +90,7 @@ class NeuralDecoder:
         """As `Decoder.step`."""
         for group in self._optimizer.param_groups:
             group["lr"] = rate * group["base_rate"]
+        drop_faults(self.weights.values())
         self._optimizer.step()
         self._optimizer.zero_grad()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shared.errors import InputError
 from shared.tracks import Advance, FrameRecord, KeyframeData
 
+_FURTHEST_M = 10_000.0  # voxels of a map are numbered that far
 _Shaped = Mapping[str, tuple[NDArray, tuple[int, ...]]]
 
 
@@ -32,8 +33,21 @@ def _check_shapes(where: str, arrays: _Shaped) -> None:
     for name, (array, shape) in arrays.items():
         if array.shape != shape:
             raise InputError(f"{where}.{name}", f"must have shape {shape}, got {array.shape}")
-        if shape[-2:] == (4, 4) and not np.isfinite(array).all():
+        if shape[-2:] == (4, 4) and not _is_rigid(array.reshape(-1, 4, 4)):
+            reason = f"must be a rotation and a shift of at most {_FURTHEST_M:.0f} m"
+            raise InputError(f"{where}.{name}", reason)
+        if name == "correction.positions_world" and not np.isfinite(array).all():
             raise InputError(f"{where}.{name}", "must be finite")
+
+
+def _is_rigid(T: NDArray[np.float64]) -> bool:
+    """Whether transforms [N, 4, 4] are rotations (to a thousandth) and sane shifts."""
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    if not np.isfinite(T).all() or (np.abs(t) > _FURTHEST_M).any():
+        return False
+    products = R @ R.transpose(0, 2, 1)
+    is_orthonormal = np.abs(products - np.eye(3)).max(initial=0.0) < 1e-3
+    return bool(is_orthonormal and (np.linalg.det(R) > 0).all())
 
 
 def _shapes_of_record(record: FrameRecord) -> _Shaped:

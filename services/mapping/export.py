@@ -34,7 +34,7 @@ def ply_bytes(baked: BakedGaussians) -> bytes:
         means,
         np.zeros_like(means),
         harmonics[:, 0],
-        harmonics[:, 1:].transpose(0, 2, 1).reshape(len(means), -1),
+        harmonics[:, 1:].transpose(0, 2, 1).reshape(len(means), 3 * (harmonics.shape[1] - 1)),
         np.log(opacities / (1.0 - opacities)),
         np.log(scales.clip(1e-9)),
         quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-12),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numba
@@ -16,6 +17,7 @@ from services.mapping.rows import RowTable
 BETA_MEAN = 0.9
 BETA_SQUARE = 0.999
 EPSILON = 1e-12
+STEEPEST = 1e15  # a slope beyond is a fault: its square would end every later step of its row
 _PIECE = 1024
 
 
@@ -58,6 +60,7 @@ def adam_rows(step: RowStep, name: str, gradient: Tensor, rate: float) -> None:
     """Step column `name` with `gradient` [V, D] and its moments `name_mean`, `name_square`.
 
     The step is scaled by the column `rate` of each row. Rows that are not named keep everything.
+    A slope that is no number, or so large that its square is none, counts as 0.
     """
     if gradient.device.type == "cpu":
         _adam_cpu(step, name, gradient, rate)
@@ -65,9 +68,17 @@ def adam_rows(step: RowStep, name: str, gradient: Tensor, rate: float) -> None:
         adam_rows_torch(step, name, gradient, rate)
 
 
+def drop_faults(parameters: Iterable[Tensor]) -> None:
+    """Let slopes that are no numbers count as 0, before an optimizer of torch steps on them."""
+    for parameter in parameters:
+        if parameter.grad is not None:
+            parameter.grad.nan_to_num_(0.0, 0.0, 0.0)
+
+
 def adam_rows_torch(step: RowStep, name: str, gradient: Tensor, rate: float) -> None:
     """`adam_rows` in plain torch, for any device."""
     rows, index, corrections = step.rows, step.index, step.corrections
+    gradient = torch.where(gradient.abs() < STEEPEST, gradient, 0.0)
     mean = rows[f"{name}_mean"][index].lerp(gradient, 1.0 - BETA_MEAN)
     square = rows[f"{name}_square"][index].lerp(gradient * gradient, 1.0 - BETA_SQUARE)
     rows[f"{name}_mean"][index] = mean
@@ -90,6 +101,7 @@ def _adam_kernel(part, columns, rate, counter):  # pragma: no cover - compiled
     value, mean, square = columns
     one = np.float32(1.0)
     b1, b2, epsilon = np.float32(BETA_MEAN), np.float32(BETA_SQUARE), np.float32(EPSILON)
+    steepest = np.float32(STEEPEST)
     while True:
         start = fetch_add(counter, 0, _PIECE)
         if start >= index.size:
@@ -98,6 +110,8 @@ def _adam_kernel(part, columns, rate, counter):  # pragma: no cover - compiled
             i, row_rate = index[row], rate * rates[row]
             for d in range(gradient.shape[1]):
                 g = gradient[row, d]
+                if not abs(g) < steepest:
+                    g = np.float32(0.0)
                 m = b1 * mean[i, d] + (one - b1) * g
                 v = b2 * square[i, d] + (one - b2) * g * g
                 mean[i, d] = m

@@ -163,10 +163,13 @@ class Mapper:
         confidence = self.sightings.confidence(images, view, keyframes)
         return moment, RenderReply(moment.revision, *images, confidence)
 
-    def state(self) -> MapState:
-        """Everything that a snapshot needs to go on exactly as if nothing had happened."""
+    def state(self, room: Mapping[str, Tensor] | None = None) -> MapState:
+        """Everything that a snapshot needs to go on exactly as if nothing had happened.
+
+        Quick where there is `room` for the anchors, from `anchors.rows.room()`.
+        """
         groups = {
-            "anchors": self.anchors.state(),
+            "anchors": self.anchors.state(room),
             **self.decoder.state(),
             **self._environment.state(),
             "exposures": as_tensors(self.exposures.state()),
@@ -215,6 +218,8 @@ class Mapper:
                 return
             with self.stages.stage("loss"):
                 loss = self._loss(drawn.rendered, target, appearance, self.config.loss)
+            if not bool(loss.total.isfinite()):
+                return
             with self.stages.stage("backward"):
                 loss.total.backward()
             with self.stages.stage("update"), self._changing:

@@ -202,7 +202,7 @@ class Session:
                 self._worker.drain()
                 capture = self.ledger.capture()
                 revision = self.ledger.revision
-                state, job = self._worker.visit(lambda mapper: (mapper.state(), self.refinement))
+                state, job = self._worker.capture()
             snapshot = Snapshot(capture.entries, state, capture.keyframes, job)
             with SNAPSHOT_SECONDS.time():
                 size = write_snapshot(self._folder.path, snapshot, self._lease.check)

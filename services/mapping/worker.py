@@ -15,7 +15,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
+from torch import Tensor
+
 from services.mapping.config import MappingConfig
+from services.mapping.map_state import MapState
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.refinement import Refinement
 from services.mapping.turns import Turns
@@ -100,6 +103,18 @@ class MapWorker:
         """Ask the mapper something between two of its steps."""
         with self._turns.visit():
             return question(self._mapper)
+
+    def capture(self) -> tuple[MapState, JobStatus]:
+        """The map and its refinement at one moment.
+
+        The memory for it is made ready first: the optimisation rests while it is copied only.
+        """
+        room = self.room()
+        return self.visit(lambda mapper: (mapper.state(room), self.refinement.status))
+
+    def room(self) -> dict[str, Tensor]:
+        """Memory for the state of the anchors as they are about now."""
+        return self._mapper.anchors.rows.room()
 
     def refine(self, iterations: int) -> JobStatus:
         """Start a refinement; it gives way to new entries.

@@ -114,4 +114,4 @@ def test_depth_is_the_same_whether_kept_or_decoded_after_a_restart():
 
     found = [sightings.confidence(drawn, view, keyframes) for sightings in (kept, restarted)]
 
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1])
