@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from services.mapping.config import MappingConfig
+from services.mapping.config import AnchorConfig, DensificationConfig, MappingConfig
 from services.mapping.entries import check_entry
 from services.mapping.optimizer import adam_rows, adam_rows_torch, begin_step
 from services.mapping.pipeline import Mapper, NewKeyframe
@@ -75,6 +77,27 @@ def test_landmarks_that_are_no_numbers_make_no_anchor(mapper, frame, true_pose):
     mapper.insert_keyframe(new_keyframe(frame(4), poses, landmarks))
 
     assert not_finite(mapper) == []
+
+
+def test_memory_is_flat_once_the_cap_on_anchors_is_reached(calibration, frame, true_pose):
+    growing = DensificationConfig(
+        first_iteration=1, grow_interval=2, cull_interval=10, grow_share=0.5, min_visits=1
+    )
+    config = MappingConfig(anchors=AnchorConfig(max_anchors=900), densification=growing)
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
+    mapper.insert_keyframe(new_keyframe(frame(0), {0: true_pose(0)}))
+    mapper.iterate(50)
+    before = resident_mb()
+
+    mapper.iterate(300)
+
+    assert len(mapper.anchors) == 900
+    assert resident_mb() - before < 10.0
+
+
+def resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 @pytest.mark.parametrize("step_rows", [adam_rows, adam_rows_torch], ids=["cpu", "torch"])
