@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.mapping import new_keyframe, true_pose
+from benchmarks.mapping_run import new_keyframe, true_pose
 from pointslam.datasets import FileSequence, open_sequence
 from pointslam.synth import SynthOptions, write_sequence
 from services.mapping.config import MappingConfig
