@@ -21,7 +21,7 @@ def info() -> MapInfo:
         mode="live",
         secondary_anchors=90,
         psnr_db=None,
-        refinement=JobStatus(False, 0, 0),
+        refinement=JobStatus(),
         stages_ms={},
         iteration_ms=None,
         mapping_s=0.0,
