@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -163,14 +164,34 @@ def visible_shares(
     low = np.stack([keyframe.cone.low for keyframe in keyframes])
     high = np.stack([keyframe.cone.high for keyframe in keyframes])
     far = np.array([keyframe.cone.far_m for keyframe in keyframes])
-    views = inverse(poses)
-    points = np.einsum("kij,nj->kni", views[:, :3, :3], points_world) + views[:, None, :3, 3]
-    facing = np.einsum("kni,kij,nj->kn", points, views[:, :3, :3], normals_world) < 0.0
-    depth = points[..., 2]
-    slopes = points[..., :2] / np.maximum(depth, 1e-6)[..., None]
-    inside = ((slopes >= low[:, None]) & (slopes <= high[:, None])).all(axis=-1)
-    visible = inside & facing & (depth > 0.05) & (depth < 1.1 * far[:, None])
-    return visible.sum(axis=1) / max(1, len(points_world))
+    counts = _count_visible(points_world, normals_world, inverse(poses), low, high, 1.1 * far)
+    return counts / max(1, len(points_world))
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_visible(  # noqa: PLR0913 - compiled
+    points, normals, views, low, high, far
+):  # pragma: no cover - compiled
+    """How many points lie in each view's cone and face it, [K]."""
+    counts = np.zeros(len(views))
+    for k in range(len(views)):
+        T = views[k]
+        for n in range(len(points)):
+            p, m = points[n], normals[n]
+            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            if z <= 0.05 or z >= far[k]:
+                continue
+            x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+            y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+            u, v = x / z, y / z
+            if u < low[k, 0] or u > high[k, 0] or v < low[k, 1] or v > high[k, 1]:
+                continue
+            facing = x * (T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2])
+            facing += y * (T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2])
+            facing += z * (T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2])
+            if facing < 0.0:
+                counts[k] += 1.0
+    return counts
 
 
 def _merged_cloud(keyframes: list[StoredKeyframe], config: ContextConfig) -> PointCloud:
