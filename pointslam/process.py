@@ -47,7 +47,7 @@ class ServiceProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=os.environ | threads | {"PYTHONUNBUFFERED": "1"},
-                start_new_session=True,  # Ctrl-C is ours to handle, in order
+                process_group=0,  # Ctrl-C is ours to handle, in order; priorities hold in a session
                 preexec_fn=_die_with_parent,
             )
 

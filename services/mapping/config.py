@@ -176,8 +176,10 @@ class OwnerConfig:
     lease_s: float = 5.0  # a frozen owner's sessions are free to others after so long
     lease_store: str = ""  # SQLite beside the sessions, or postgresql://user@host/name
     max_sessions: int = 16  # open at a time; others go to another mapper
+    niceness: int = 10  # of the threads that optimise, below those that answer
 
     def __post_init__(self) -> None:
+        _check(0 <= self.niceness <= 19, "owner.niceness must be 0 to 19")
         _check(self.max_pending > 0, "owner.max_pending must be positive")
         _check(self.max_pending_live > 0, "owner.max_pending_live must be positive")
         _check(self.session_idle_s > 0, "owner.session_idle_s must be positive")

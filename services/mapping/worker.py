@@ -20,6 +20,7 @@ from torch import Tensor
 from services.mapping.config import MappingConfig
 from services.mapping.map_state import MapState
 from services.mapping.pipeline import Mapper, NewKeyframe
+from services.mapping.priority import give_way
 from services.mapping.refinement import Refinement
 from services.mapping.turns import Turns
 from shared.errors import UnavailableError
@@ -147,6 +148,7 @@ class MapWorker:
             self._changed.wait_for(lambda: is_reached() or self._is_stopping)
 
     def _run(self) -> None:
+        give_way(self._config.owner.niceness)
         while (step := self._next()) is not None:
             try:
                 step()
