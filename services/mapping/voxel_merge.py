@@ -65,7 +65,7 @@ def _merge_voxels(  # noqa: C901 - compiled
                 p[axis] += poses[cloud, axis, j] * points[i, j]
                 m[axis] += poses[cloud, axis, j] * normals[i, j]
         key = _voxel_key(p, m, voxel_size)
-        slot = (key * np.int64(-7046029254386353131)) >> np.int64(20) & np.int64(capacity - 1)
+        slot = _first_slot(key, capacity)
         while keys[slot] != -1 and keys[slot] != key:
             slot = (slot + 1) & (capacity - 1)
         if keys[slot] == -1:
@@ -87,6 +87,15 @@ def _merge_voxels(  # noqa: C901 - compiled
             merged_points[i, axis] = row[axis] / row[6]
             merged_normals[i, axis] = row[3 + axis] / length
     return merged_points, merged_normals
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _first_slot(key, capacity):  # pragma: no cover - compiled
+    """Where to look for a voxel first; a block of 4x4x4 lies side by side, in few cache lines."""
+    block = key & ~((np.int64(3) << 40) | (np.int64(3) << 20) | np.int64(3))
+    offset = ((key >> 36) & 48) | ((key >> 18) & 12) | (key & 3)
+    hashed = (block * np.int64(-7046029254386353131)) >> np.int64(40)
+    return ((hashed << 6) | offset) & np.int64(capacity - 1)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -43,16 +43,16 @@ class RegistrationConfig:
     depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
     kernel_width: float = 2.0  # of the robust kernel, in residual scales
     min_kernel_width: float = 0.1  # in depth sigmas: exact depth still meets rounded edges
-    translation_tolerance_m: float = 2e-4
-    rotation_tolerance_rad: float = 2e-4
+    tolerances: tuple[float, ...] = (1e-3, 5e-4, 2e-4)  # of a step, metres and radians
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
     effective_share: float = 0.1  # residuals of neighbours are not independent
     model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas
 
     def __post_init__(self) -> None:
-        lengths = {len(self.voxel_sizes_m), len(self.sample_steps), len(self.max_iterations)}
-        if len(lengths) != 1 or not self.voxel_sizes_m:
-            raise ConfigError("voxel_sizes_m, sample_steps and max_iterations must match in length")
+        levels = (self.voxel_sizes_m, self.sample_steps, self.max_iterations, self.tolerances)
+        if len({len(values) for values in levels}) != 1 or not self.voxel_sizes_m:
+            names = "voxel_sizes_m, sample_steps, max_iterations and tolerances"
+            raise ConfigError(f"{names} must match in length")
         ratios = [size / self.voxel_sizes_m[-1] for size in self.voxel_sizes_m]
         if any(abs(ratio - round(ratio)) > 1e-6 for ratio in ratios):
             raise ConfigError("voxel_sizes_m must be multiples of the last")

@@ -47,9 +47,8 @@ def align(
         config: levels, kernel, tolerances.
     """
     T = T_world_camera
-    levels = zip(target.levels, config.sample_steps, config.max_iterations, strict=True)
-    for level, step, iterations in levels:
-        T = _align_level(_every(source, step), level, T, iterations, config)
+    for index, level in enumerate(target.levels):
+        T = _align_level(_every(source, config.sample_steps[index]), level, T, index, config)
     return linearise(source, target.levels[-1], orthonormalise(T), config)
 
 
@@ -61,17 +60,16 @@ def _align_level(
     source: PointCloud,
     level: VoxelLevel,
     T: NDArray[np.float64],
-    iterations: int,
+    index: int,
     config: RegistrationConfig,
 ) -> NDArray[np.float64]:
-    for _ in range(iterations):
+    """Iterate on one level until it has no more to say than the next one will."""
+    tolerance = config.tolerances[index]
+    for _ in range(config.max_iterations[index]):
         H, b, _, _ = _normal_equations(source, level, T, config)
         twist = _well_determined_step(H, b, config.min_eigenvalue_share)
         T = T @ exp_twist(twist)
-        if (
-            np.linalg.norm(twist[:3]) < config.translation_tolerance_m
-            and np.linalg.norm(twist[3:]) < config.rotation_tolerance_rad
-        ):
+        if np.linalg.norm(twist[:3]) < tolerance and np.linalg.norm(twist[3:]) < tolerance:
             break
     return T
 
