@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -60,22 +59,19 @@ def match_by_projection(
 
 
 def match_by_descriptor(features: Features, landmarks: Landmarks, config: OrbConfig) -> Matches:
-    """Nearest descriptors both ways, distinct from the second nearest."""
+    """Nearest descriptors, distinct from the second nearest; each landmark to its nearest one."""
     if len(features.octaves) < 2 or len(landmarks.ids) < 2:
         return _no_matches()
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = matcher.knnMatch(features.descriptors, landmarks.descriptors, k=2)
-    pairs = [
-        (a.queryIdx, a.trainIdx, int(a.distance))
-        for a, b in forward
-        if a.distance <= config.max_hamming_bits_global
-        and a.distance < config.ratio_global * b.distance
-    ]
+    words = np.ascontiguousarray(_words(landmarks.descriptors).T)
+    nearest, bits, second_bits = _two_nearest(_words(features.descriptors), words)
+    is_distinct = bits < config.ratio_global * second_bits
+    rows = np.flatnonzero((bits <= config.max_hamming_bits_global) & is_distinct)
     best = np.full(len(landmarks.ids), -1, np.int64)
     distances = np.full(len(landmarks.ids), 257, np.int64)
-    for feature, landmark, distance in pairs:
-        if distance < distances[landmark]:
-            best[landmark], distances[landmark] = feature, distance
+    for feature in rows:
+        landmark = nearest[feature]
+        if bits[feature] < distances[landmark]:
+            best[landmark], distances[landmark] = feature, bits[feature]
     return _one_to_one(best, distances, len(features.octaves))
 
 
@@ -211,6 +207,32 @@ def _search(  # noqa: C901, PLR0913 - compiled
 
 
 @numba.njit(cache=True, nogil=True)
+def _two_nearest(words, others):  # pragma: no cover - compiled
+    """Of each descriptor [M, 4]: the nearest of the others [4, L], its bits and the second's."""
+    nearest = np.empty(len(words), np.int64)
+    bits = np.empty(len(words), np.int64)
+    second_bits = np.empty(len(words), np.int64)
+    distances = np.empty(others.shape[1], np.int64)
+    for m in range(len(words)):
+        a, b, c, d = words[m]
+        for n in range(others.shape[1]):  # vectors: no branch before all distances are there
+            distances[n] = (
+                popcount(others[0, n] ^ a)
+                + popcount(others[1, n] ^ b)
+                + popcount(others[2, n] ^ c)
+                + popcount(others[3, n] ^ d)
+            )
+        best, first, second = 0, 257, 257
+        for n in range(others.shape[1]):
+            if distances[n] < first:
+                best, first, second = n, distances[n], first
+            elif distances[n] < second:
+                second = distances[n]
+        nearest[m], bits[m], second_bits[m] = best, first, second
+    return nearest, bits, second_bits
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def popcount(x):  # pragma: no cover - compiled
     """Number of ones in a 64 bit word."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
