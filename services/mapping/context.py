@@ -195,14 +195,13 @@ def _count_visible(  # noqa: PLR0913 - compiled
 
 
 def _merged_cloud(keyframes: list[StoredKeyframe], config: ContextConfig) -> PointCloud:
-    cloud = merge_clouds(
+    # Voxels are in order of first sight, best overlap first: the tail is what matters least.
+    return merge_clouds(
         [keyframe.cloud_camera for keyframe in keyframes],
         [keyframe.T_world_camera for keyframe in keyframes],
         config.voxel_size_m,
+        config.max_points,
     )
-    # Voxels are in order of first sight, best overlap first: the tail is what matters least.
-    limit = config.max_points
-    return PointCloud(cloud.points[:limit], cloud.normals[:limit])
 
 
 def _context_landmark_ids(

@@ -13,6 +13,7 @@ def merge_clouds(
     clouds_camera: list[PointCloud],
     T_world_cameras: list[NDArray[np.float64]],
     voxel_size_m: float,
+    max_points: int,
 ) -> PointCloud:
     """Merge clouds in the world frame, each point weighted by the precision of its depth.
 
@@ -20,6 +21,7 @@ def merge_clouds(
         clouds_camera: one cloud a camera; normals of unit length.
         T_world_cameras: their poses.
         voxel_size_m: side of the voxels.
+        max_points: voxels that come to sight when there are so many are left out.
 
     Returns:
         one point a voxel and main direction of the normal, in order of first sight.
@@ -30,6 +32,7 @@ def merge_clouds(
         np.cumsum([len(cloud.points) for cloud in clouds_camera]),
         np.stack(T_world_cameras),
         voxel_size_m,
+        max_points,
     )
     return PointCloud(merged_points, merged_normals)
 
@@ -42,18 +45,18 @@ def _depth_precision(depth_m):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _merge_voxels(  # noqa: C901 - compiled
-    points, normals, ends, poses, voxel_size
+def _merge_voxels(  # noqa: C901, PLR0913 - compiled
+    points, normals, ends, poses, voxel_size, limit
 ):  # pragma: no cover - compiled
     count = len(points)
     p, m = np.zeros(3), np.zeros(3)
     cloud = 0
     capacity = 16
-    while capacity <= count:
+    while capacity < 2 * min(count, limit):
         capacity *= 2
     keys = np.full(capacity, -1, np.int64)
     slots = np.zeros(capacity, np.int32)
-    sums = np.zeros((count, 7), np.float64)
+    sums = np.zeros((min(count, limit), 7), np.float64)
     used = 0
     for i in range(count):
         while i >= ends[cloud]:
@@ -69,6 +72,8 @@ def _merge_voxels(  # noqa: C901 - compiled
         while keys[slot] != -1 and keys[slot] != key:
             slot = (slot + 1) & (capacity - 1)
         if keys[slot] == -1:
+            if used == limit:
+                continue
             keys[slot] = key
             slots[slot] = used
             used += 1

@@ -62,8 +62,7 @@ def match_by_descriptor(features: Features, landmarks: Landmarks, config: OrbCon
     """Nearest descriptors, distinct from the second nearest; each landmark to its nearest one."""
     if len(features.octaves) < 2 or len(landmarks.ids) < 2:
         return _no_matches()
-    words = np.ascontiguousarray(_words(landmarks.descriptors).T)
-    nearest, bits, second_bits = _two_nearest(_words(features.descriptors), words)
+    nearest, bits, second_bits = two_nearest(features.descriptors, landmarks.descriptors)
     is_distinct = bits < config.ratio_global * second_bits
     rows = np.flatnonzero((bits <= config.max_hamming_bits_global) & is_distinct)
     best = np.full(len(landmarks.ids), -1, np.int64)
@@ -73,6 +72,13 @@ def match_by_descriptor(features: Features, landmarks: Landmarks, config: OrbCon
         if bits[feature] < distances[landmark]:
             best[landmark], distances[landmark] = feature, bits[feature]
     return _one_to_one(best, distances, len(features.octaves))
+
+
+def two_nearest(
+    descriptors: NDArray[np.uint8], others: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Of each descriptor [M, 32] among others [L, 32]: the nearest row, its bits, the second's."""
+    return _two_nearest(_words(descriptors), np.ascontiguousarray(_words(others).T))
 
 
 def _no_matches() -> Matches:

@@ -198,7 +198,7 @@ def test_opposite_sides_of_a_thin_wall_are_not_averaged():
     front = wall_cloud()
     back = PointCloud(front.points + np.array([0, 0, 0.005], np.float32), -front.normals)
 
-    merged = merge_clouds([front, back], [np.eye(4), np.eye(4)], 0.02)
+    merged = merge_clouds([front, back], [np.eye(4), np.eye(4)], 0.02, max_points=100)
 
     np.testing.assert_allclose(np.abs(merged.normals[:, 2]), 1.0)
 
@@ -209,3 +209,16 @@ def test_opposite_sides_of_a_thin_wall_are_not_averaged():
 def test_settings_out_of_range_are_refused(change):
     with pytest.raises(ConfigError):
         ContextConfig(**change)
+
+
+def test_voxels_beyond_the_limit_are_left_out_and_the_others_stay_the_same():
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 3.0], (3000, 3)).astype(np.float32)
+    cloud = PointCloud(points, np.tile(np.float32([0.0, 0.0, -1.0]), (3000, 1)))
+
+    all_of_it = merge_clouds([cloud], [np.eye(4)], 0.1, max_points=3000)
+    some = merge_clouds([cloud], [np.eye(4)], 0.1, max_points=500)
+
+    assert len(all_of_it.points) > 500
+    np.testing.assert_array_equal(some.points, all_of_it.points[:500])
+    np.testing.assert_array_equal(some.normals, all_of_it.normals[:500])

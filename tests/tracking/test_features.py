@@ -4,7 +4,12 @@ import cv2
 import numpy as np
 
 from services.tracking.config import OrbConfig, RelocalizationConfig
-from services.tracking.matching import match_by_descriptor, match_by_projection, popcount
+from services.tracking.matching import (
+    match_by_descriptor,
+    match_by_projection,
+    popcount,
+    two_nearest,
+)
 from services.tracking.orb import extract_features, spread
 from services.tracking.relocalization import locate
 from shared.rectify import RgbdImage
@@ -104,6 +109,22 @@ def test_no_feature_and_no_landmark_is_matched_twice(room):
         assert len(matches) > 20
         assert len(set(matches.features.tolist())) == len(matches)
         assert len(set(matches.landmarks.tolist())) == len(matches)
+
+
+def test_the_two_nearest_descriptors_are_those_of_opencv():
+    rng = np.random.default_rng(7)
+    some, others = (
+        rng.integers(0, 256, (50, 32), np.uint8),
+        rng.integers(0, 256, (333, 32), np.uint8),
+    )
+    some[:20] = others[100:120]
+
+    nearest, bits, second_bits = two_nearest(some, others)
+
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(some, others, k=2)
+    np.testing.assert_array_equal(nearest, [a.trainIdx for a, _ in pairs])
+    np.testing.assert_array_equal(bits, [a.distance for a, _ in pairs])
+    np.testing.assert_array_equal(second_bits, [b.distance for _, b in pairs])
 
 
 def test_a_camera_is_located_by_features_alone(room):

@@ -82,3 +82,20 @@ def test_one_depth_image_gives_the_same_bits_twice():
 
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_array_equal(a.normals, b.normals)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (541, 363)])
+def test_rows_of_the_grid_give_the_bits_of_single_pixels(size):
+    rng = np.random.default_rng(3)
+    camera = Intrinsics(260.0, 260.0, 159.5, 119.5, *size)
+    depth = rng.uniform(1.0, 1.02, size[::-1]).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0.0
+    depth[50:80, 40:90] = 0.6  # with edges
+
+    cloud = surface_from_depth(depth, camera, SurfaceConfig())
+
+    pixels = cloud.points[:, :2] / cloud.points[:, 2:] * 260.0 + np.float32([159.5, 119.5])
+    assert len(cloud.points) > 1000
+    np.testing.assert_array_equal(
+        cloud.normals, normals_at(depth, np.rint(pixels), camera, SurfaceConfig())
+    )
