@@ -148,10 +148,12 @@ def _held_by_geometry(
     intrinsics: Intrinsics,
     config: TrackingConfig,
 ) -> _Held:
-    """The new keyframe where it registers best, the others where they are."""
+    """The new keyframe where it registers best, the others where they are; fixed ones need none."""
     poses = np.stack([member.T_world_camera for member in window])
-    information = pose_information(
-        context.cloud_world, poses, keyframe.registration, intrinsics, config
+    free = np.flatnonzero([not member.is_fixed for member in window])
+    information = np.zeros((len(window), 6, 6))
+    information[free] = pose_information(
+        context.cloud_world, poses[free], keyframe.registration, intrinsics, config
     )
     poses[-1] = optimum(keyframe.registration, config.registration)
     information[-1] = keyframe.registration.information
@@ -206,7 +208,9 @@ def _correction(
 
 
 @numba.njit(cache=True, nogil=True)
-def _visible_hessians(points, normals, views, camera, noise):  # pragma: no cover - compiled
+def _visible_hessians(  # noqa: C901 - compiled
+    points, normals, views, camera, noise
+):  # pragma: no cover - compiled
     out = np.zeros((len(views), 6, 6))
     J = np.zeros(6)
     p = np.zeros(3)
@@ -226,12 +230,16 @@ def _visible_hessians(points, normals, views, camera, noise):  # pragma: no cove
             v = camera[1] * p[1] / p[2] + camera[3]
             if u < 0.0 or v < 0.0 or u >= camera[4] or v >= camera[5]:
                 continue
-            sigma = noise[0] + noise[1] * p[2] * p[2]
+            weight = 1.0 / (noise[0] + noise[1] * p[2] * p[2]) ** 2
             J[0], J[1], J[2] = m[0], m[1], m[2]
             J[3] = p[1] * m[2] - p[2] * m[1]
             J[4] = p[2] * m[0] - p[0] * m[2]
             J[5] = p[0] * m[1] - p[1] * m[0]
             for i in range(6):
-                for j in range(6):
-                    out[k, i, j] += J[i] * J[j] / (sigma * sigma)
+                scaled = weight * J[i]
+                for j in range(i, 6):
+                    out[k, i, j] += scaled * J[j]
+        for i in range(6):
+            for j in range(i):
+                out[k, i, j] = out[k, j, i]
     return out
