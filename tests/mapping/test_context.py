@@ -214,7 +214,7 @@ def test_settings_out_of_range_are_refused(change):
 def test_voxels_beyond_the_limit_are_left_out_and_the_others_stay_the_same():
     rng = np.random.default_rng(5)
     points = rng.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 3.0], (3000, 3)).astype(np.float32)
-    cloud = PointCloud(points, np.tile(np.float32([0.0, 0.0, -1.0]), (3000, 1)))
+    cloud = PointCloud(points, np.tile(np.array([0.0, 0.0, -1.0], np.float32), (3000, 1)))
 
     all_of_it = merge_clouds([cloud], [np.eye(4)], 0.1, max_points=3000)
     some = merge_clouds([cloud], [np.eye(4)], 0.1, max_points=500)

@@ -94,7 +94,9 @@ def test_rows_of_the_grid_give_the_bits_of_single_pixels(size):
 
     cloud = surface_from_depth(depth, camera, SurfaceConfig())
 
-    pixels = cloud.points[:, :2] / cloud.points[:, 2:] * 260.0 + np.float32([159.5, 119.5])
+    pixels = cloud.points[:, :2] / cloud.points[:, 2:] * 260.0 + np.array(
+        [159.5, 119.5], np.float32
+    )
     assert len(cloud.points) > 1000
     np.testing.assert_array_equal(
         cloud.normals, normals_at(depth, np.rint(pixels), camera, SurfaceConfig())
