@@ -67,7 +67,7 @@ class DecoderConfig:
 class LearningRates:
     """Steps of Adam, per parameter."""
 
-    features: float = 1e-2
+    features: float = 0.025
     offsets: float = 0.02
     scalings: float = 7e-3
     colours: float = 0.05  # of plain Gaussians, as the next three
@@ -102,6 +102,7 @@ class DensificationConfig:
     first_iteration: int = 1500
     grow_interval: int = 200
     grow_share: float = 0.01  # of the anchors, each time
+    grow_until: float = 0.5  # of a refinement: what grows at its end stays untrained
     min_visits: int = 8  # a child is judged after so many iterations that saw it
     cull_interval: int = 200
     rule: str = "scaffold"  # or "halving": the paper's, where a voxel with too large a gradient

@@ -136,13 +136,12 @@ class Mapper:
     def iterate(self, count: int = 1) -> None:
         """Optimise on so many draws of keyframes (paper Eq. 8); nothing without keyframes."""
         for _ in range(count if len(self.views) else 0):
-            self._step(self.views.draw(), rate=1.0)
+            self._step(self.views.draw(), progress=0.0)
 
     def refine(self, progress: float) -> None:
         """One iteration of a refinement, at 0 <= `progress` < 1 of it; rates decay with it."""
         if len(self.views):
-            decay = self.config.rates.refinement_decay
-            self._step(self.views.draw_in_rounds(), rate=decay**progress)
+            self._step(self.views.draw_in_rounds(), progress)
 
     def render(self, request: RenderRequest) -> RenderReply:
         """A view of the map, with the exposure of a time or the mean one."""
@@ -206,8 +205,9 @@ class Mapper:
         self._rng.bit_generator.state = state.values["generator"]
         self.views.restore(state.values["views"], frames)
 
-    def _step(self, keyframe: TrainingView, rate: float) -> None:
-        """One optimisation step on one keyframe."""
+    def _step(self, keyframe: TrainingView, progress: float) -> None:
+        """One optimisation step on one keyframe, at 0 <= `progress` < 1 of a refinement."""
+        rate = self.config.rates.refinement_decay**progress
         with self.stages.stage("target"):
             target = self.views.target(keyframe.seq)
         exposure = torch.from_numpy(self.exposures.of(keyframe.seq)).to(self._device)
@@ -226,7 +226,7 @@ class Mapper:
                 self._update(drawn, rate)
                 assert exposure.grad is not None
                 self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rate)
-                self._densify(drawn)
+                self._densify(drawn, progress)
         self._squared_errors.append(float(loss.squared_error))
 
     def _draw(self, keyframe: TrainingView, target: Target) -> Drawn:
@@ -248,7 +248,7 @@ class Mapper:
         self.decoder.step(rate)
 
     @torch.no_grad()
-    def _densify(self, drawn: Drawn) -> None:
+    def _densify(self, drawn: Drawn, progress: float) -> None:
         """Grow where the screen gradient stays large, cull what hardly shows."""
         config = self.config.densification
         self.iterations += 1
@@ -260,8 +260,8 @@ class Mapper:
         )
         if self.iterations % config.cull_interval == 0:
             densification.cull(self.anchors, config)
-        is_grown = self.iterations >= config.first_iteration
-        if is_grown and self.iterations % config.grow_interval == 0:
+        is_growing = self.iterations >= config.first_iteration and progress < config.grow_until
+        if is_growing and self.iterations % config.grow_interval == 0:
             densification.grow(self.anchors, config, self.config.anchors, self._rng)
 
     def _follow_corrections(self, poses: KeyframePoses) -> None:

@@ -250,6 +250,19 @@ def test_adams_moments_follow_anchors_when_others_go_and_come(mapper, insert):
         assert not rows[name][kept:].any()
 
 
+def test_anchors_grow_in_the_first_part_of_a_refinement_only(calibration, insert):
+    densification = DensificationConfig(first_iteration=0, grow_interval=1, min_visits=1)
+    mapper = Mapper(calibration, MappingConfig(densification=densification), 0, torch.device("cpu"))
+    insert(mapper, 0)
+    sizes = [len(mapper.anchors)]
+
+    for progress in (0.1, 0.6, 0.9):
+        mapper.refine(progress)
+        sizes.append(len(mapper.anchors))
+
+    assert sizes[0] < sizes[1] == sizes[2] == sizes[3]
+
+
 def test_a_keyframe_whose_image_is_damaged_is_refused_and_not_trained_on(
     mapper, insert, frame, true_pose
 ):
