@@ -69,9 +69,11 @@ def worker(endpoint: str) -> Iterator[Process]:
     command = [sys.executable, "-m", "services.tracking", "--connect", endpoint, "--id", _SESSION]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        process.stdout.readline()
-        yield Process(process.pid)
-        process.terminate()
+        try:
+            process.stdout.readline()
+            yield Process(process.pid)
+        finally:  # else an error here would wait for the worker, which waits for requests
+            process.terminate()
 
 
 def run(folder: Folder, name: str, frames: int) -> Row:
