@@ -18,6 +18,7 @@ from torch import Tensor
 from services.mapping.anchors import FEATURES, AnchorMap, trained_widths
 from services.mapping.config import AnchorConfig, DecoderConfig, LearningRates
 from services.mapping.rasterizer import Gaussians
+from services.mapping.weight_adam import WeightAdam
 
 VIEW = 4  # direction and distance from camera to anchor
 DISTANCE_SCALE = 0.2  # per metre, so that indoor distances are about 1
@@ -78,8 +79,8 @@ def initial_weights(anchors: AnchorConfig, decoder: DecoderConfig, seed: int) ->
     }
 
 
-def weight_optimizer(weights: Weights, rates: LearningRates) -> torch.optim.Adam:
-    """Adam over the networks; each group remembers its `base_rate`."""
+def weight_optimizer(weights: Weights, rates: LearningRates) -> WeightAdam:
+    """Adam over the networks."""
     per_network = {
         "hidden": rates.covariance_network,
         "opacity": rates.opacity_network,
@@ -87,12 +88,8 @@ def weight_optimizer(weights: Weights, rates: LearningRates) -> torch.optim.Adam
         "covariance": rates.covariance_network,
         "skip": rates.opacity_network,
     }
-    groups = [
-        {"params": [weights[name]], "lr": rate, "base_rate": rate}
-        for name in WEIGHTS
-        for rate in (per_network[name.split("_")[0]],)
-    ]
-    return torch.optim.Adam(groups, eps=1e-15, fused=True)
+    ordered = {name: weights[name] for name in WEIGHTS}
+    return WeightAdam(ordered, {name: per_network[name.split("_")[0]] for name in WEIGHTS})
 
 
 def decode(

@@ -18,8 +18,6 @@ from services.mapping.decoder import (
     weight_optimizer,
 )
 from services.mapping.decoder_cpu import decode_cpu
-from services.mapping.map_state import restore_moments, weight_moments
-from services.mapping.optimizer import drop_faults
 from services.mapping.plain_decoder import PlainAnchors, decode_plain
 from services.mapping.rasterizer import Gaussians
 
@@ -88,23 +86,19 @@ class NeuralDecoder:
 
     def step(self, rate: float) -> None:
         """As `Decoder.step`."""
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate * group["base_rate"]
-        drop_faults(self.weights.values())
-        self._optimizer.step()
-        self._optimizer.zero_grad()
+        self._optimizer.step(rate)
 
     def state(self) -> Groups:
         """Weights and Adam's moments."""
         weights = {name: weight.detach().cpu().clone() for name, weight in self.weights.items()}
-        return {"weights": weights, "adam": weight_moments(self._optimizer)}
+        return {"weights": weights, "adam": self._optimizer.state()}
 
     @torch.no_grad()
     def restore(self, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
         """As `Decoder.restore`."""
         for name, weight in self.weights.items():
             weight.copy_(groups["weights"][name])
-        restore_moments(self._optimizer, groups.get("adam", {}))
+        self._optimizer.restore(groups.get("adam", {}))
 
 
 class PlainDecoder:

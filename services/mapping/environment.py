@@ -18,7 +18,7 @@ from torch import Tensor
 from services.mapping.anchors import FEATURES, AnchorMap
 from services.mapping.config import MappingConfig
 from services.mapping.decoders import Visible
-from services.mapping.map_state import restore_moments, weight_moments
+from services.mapping.weight_adam import WeightAdam
 
 SEEN = 6  # colour and unit direction from the camera
 _HIDDEN = 32
@@ -33,14 +33,14 @@ class Environment:
 
     def __init__(self, config: MappingConfig, seed: int, device: torch.device) -> None:
         self._kind = config.anchors.features
-        self._rate = config.rates.colour_network
         self._colours = 3 * config.anchors.children
         self._generator = torch.Generator().manual_seed(seed)
         self._weights: dict[str, Tensor] = {}
         if self._kind in ("environment", "both"):
             weights = _initial_weights(self._generator)
             self._weights = {n: w.to(device).requires_grad_() for n, w in weights.items()}
-            self._optimizer = torch.optim.Adam([*self._weights.values()], lr=self._rate, eps=1e-15)
+            rates = dict.fromkeys(self._weights, config.rates.colour_network)
+            self._optimizer = WeightAdam(self._weights, rates)
             self._warm_up(device)
 
     @torch.no_grad()
@@ -74,14 +74,14 @@ class Environment:
         gradient = visible.features.grad[is_young]  # pyright: ignore
         first = 0 if self._kind == "environment" else self._colours
         self._embed(seen[is_young])[:, first:].backward(gradient[:, first:])
-        self._advance(rate)
+        self._optimizer.step(rate)
 
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Groups of tensors for a snapshot."""
         groups = {"environment_generator": {"state": self._generator.get_state()}}
         if self._weights:
             weights = {n: w.detach().cpu().clone() for n, w in self._weights.items()}
-            groups |= {"environment": weights, "environment_adam": weight_moments(self._optimizer)}
+            groups |= {"environment": weights, "environment_adam": self._optimizer.state()}
         return groups
 
     @torch.no_grad()
@@ -91,18 +91,12 @@ class Environment:
         for name, weight in self._weights.items():
             weight.copy_(groups["environment"][name])
         if self._weights:
-            restore_moments(self._optimizer, groups["environment_adam"])
+            self._optimizer.restore(groups["environment_adam"])
 
     def _embed(self, seen: Tensor) -> Tensor:
         w = self._weights
         hidden = torch.relu(seen @ w["hidden_weight"] + w["hidden_bias"])
         return hidden @ w["output_weight"] + w["output_bias"]
-
-    def _advance(self, rate: float) -> None:
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate * self._rate
-        self._optimizer.step()
-        self._optimizer.zero_grad()
 
     def _warm_up(self, device: torch.device) -> None:
         """Fit the embedding until the untrained colour network gives back the colours."""
@@ -113,7 +107,7 @@ class Environment:
             features = self._embed(torch.cat([colours, direction], 1).to(device))
             shown = torch.sigmoid(features[:, : self._colours]).view(_WARM_UP_BATCH, -1, 3)
             (shown - colours.to(device)[:, None]).square().mean().backward()
-            self._advance(1.0)
+            self._optimizer.step(1.0)
 
 
 def _initial_weights(generator: torch.Generator) -> dict[str, Tensor]:

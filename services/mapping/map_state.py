@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-
 
 @dataclass(frozen=True)
 class MapState:
@@ -43,22 +41,3 @@ def as_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
 def as_arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     """Tensors of the host as numpy arrays."""
     return {name: tensor.numpy() for name, tensor in tensors.items()}
-
-
-def weight_moments(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
-    """Adam's state as `index.moment`; empty before the first step."""
-    return {
-        f"{index}.{moment}": values[moment].cpu().clone()
-        for index, values in optimizer.state_dict()["state"].items()
-        for moment in _MOMENTS
-    }
-
-
-def restore_moments(optimizer: torch.optim.Adam, moments: Mapping[str, Tensor]) -> None:
-    """Put `weight_moments` back."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for dotted, tensor in moments.items():
-        index, _, moment = dotted.partition(".")
-        state.setdefault(int(index), {})[moment] = tensor
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": state, "param_groups": groups})
