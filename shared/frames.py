@@ -86,6 +86,7 @@ class Prior:
 
     `seq` and `t_ns` are of the last frame with a pose; `T_before_last` is its motion: it maps
     points of the last camera to the camera of the frame with a pose before it (identity at first).
+    Of an image that was sent more than once, time, odometry and motion are of the first time.
     """
 
     seq: int

@@ -20,6 +20,8 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
             lost_frames=prior.lost_frames + 1,
             frames_since_keyframe=prior.frames_since_keyframe + 1,
         )
+    if prior is not None and prior.frame_digest == frame.digest():
+        return _after_repeat(prior, result)
     dt_ns = 0 if prior is None else result.t_ns - prior.t_ns
     newest = prior.newest_keyframe_seq if prior else result.reference_seq
     since = prior.frames_since_keyframe + 1 if prior else 0
@@ -35,6 +37,22 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
         frames_since_keyframe=0 if is_keyframe else since,
         T_odom_camera=frame.T_odom_camera,
         frame_digest=frame.digest(),
+        T_reference_camera=result.T_reference_camera,
+    )
+
+
+def _after_repeat(prior: Prior, result: TrackResult) -> Prior:
+    """The prior after the same image again: it tells nothing of how the camera moved since.
+
+    Time, odometry and motion stay those of the image when it was new; a repeat is no keyframe.
+    """
+    return dataclasses.replace(
+        prior,
+        seq=result.seq,
+        T_world_camera=result.T_world_camera,
+        reference_seq=result.reference_seq,
+        lost_frames=0,
+        frames_since_keyframe=prior.frames_since_keyframe + 1,
         T_reference_camera=result.T_reference_camera,
     )
 

@@ -18,7 +18,11 @@ from shared.frames import (
 from shared.se3 import exp
 from shared.tracks import FrameRecord, KeyframePoses, OpenReply, TrackResult
 
-FRAME = Frame(9, 900, ColourImage(ColourEncoding.JPEG, b""), DepthImage(DepthEncoding.RAW16, b""))
+
+def frame(seq, image=None):
+    """A frame; its image is that of its own number unless told."""
+    rgb = ColourImage(ColourEncoding.JPEG, bytes([seq if image is None else image]))
+    return Frame(seq, 100 * seq, rgb, DepthImage(DepthEncoding.RAW16, b""))
 
 
 def result(seq, T_world_camera, status=TrackingStatus.TRACKED, keyframe=None):
@@ -37,8 +41,8 @@ def result(seq, T_world_camera, status=TrackingStatus.TRACKED, keyframe=None):
     )
 
 
-def after(prior, answer):
-    following = next_prior(prior, FRAME, answer)
+def after(prior, answer, image=None):
+    following = next_prior(prior, frame(answer.seq, image), answer)
     assert following is not None
     return following
 
@@ -62,6 +66,17 @@ def test_the_motion_maps_points_of_the_last_camera_to_the_one_before(first):
     assert (second.before_last_dt_ns, second.frames_since_keyframe) == (300, 1)
 
 
+def test_a_repeated_image_leaves_time_and_motion_as_when_it_was_new(first):
+    T_world_camera = exp([0.1, 0.0, 0.0, 0.0, 0.1, 0.0])
+    second = after(first, result(1, T_world_camera))
+
+    repeated = after(second, result(2, T_world_camera), image=1)
+
+    assert (repeated.seq, repeated.frames_since_keyframe) == (2, 2)
+    assert (repeated.t_ns, repeated.before_last_dt_ns) == (100, 100)
+    np.testing.assert_array_equal(repeated.T_before_last, second.T_before_last)
+
+
 def test_a_lost_frame_keeps_the_last_pose_and_counts(first):
     lost = after(first, result(4, exp([9, 9, 9, 0, 0, 0]), TrackingStatus.LOST))
 
@@ -78,7 +93,7 @@ def test_a_pose_after_lost_frames_ends_the_count(first):
 
 
 def test_a_session_without_a_pose_has_no_prior():
-    assert next_prior(None, FRAME, result(0, np.eye(4), TrackingStatus.NEED_FRAMES)) is None
+    assert next_prior(None, frame(0), result(0, np.eye(4), TrackingStatus.NEED_FRAMES)) is None
 
 
 def opened(last, keyframe_seqs):
