@@ -2,7 +2,8 @@
 #   docker build -f docker/mapping.Dockerfile -t pointslam/mapping .
 FROM python:3.11-slim
 
-ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_WAIT_POLICY=passive PYTHONUNBUFFERED=1
+ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_WAIT_POLICY=passive MALLOC_ARENA_MAX=2 \
+    PYTHONUNBUFFERED=1
 WORKDIR /app
 COPY pyproject.toml README.md requirements.lock ./
 COPY shared/ shared/

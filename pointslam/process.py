@@ -16,7 +16,12 @@ from shared.errors import UnavailableError
 _PR_SET_PDEATHSIG = 1
 _TAIL_LINES = 15
 _LIBC = ctypes.CDLL(None, use_errno=True)
-_SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_DEFAULTS = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "2",  # else what each of many threads once needed stays with its own arena
+}
 
 
 @dataclass(frozen=True)
@@ -39,14 +44,13 @@ class ServiceProcess:
         self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        threads = {name: os.environ.get(name, "1") for name in _SINGLE_THREADED}
         with self.log.open("wb") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", self.command.module, *self.command.arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=os.environ | threads | {"PYTHONUNBUFFERED": "1"},
+                env=_DEFAULTS | os.environ | {"PYTHONUNBUFFERED": "1"},
                 process_group=0,  # Ctrl-C is ours to handle, in order; priorities hold in a session
                 preexec_fn=_die_with_parent,
             )
