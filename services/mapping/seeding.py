@@ -6,6 +6,7 @@ iterations (zero offsets, the literal reading, were measured 0.95 dB worse).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from services.mapping.anchors import FEATURES, NewAnchors
 from services.mapping.config import AnchorConfig
 from services.mapping.depth_fill import filled_depth
 from services.mapping.voxels import centres, levels_at, sizes_m, voxel_keys
+from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
 from shared.se3 import inverse, transform
 
@@ -77,29 +79,70 @@ def seed_anchors(
     )
 
 
-def _landmark_keys(request: SeedRequest, config: AnchorConfig) -> NDArray[np.int64]:
-    points = request.landmarks_world.reshape(-1, 3)
-    depths = transform(inverse(request.T_world_camera), points)[:, 2]
-    in_front = depths > 0.0
-    return voxel_keys(points[in_front], levels_at(depths[in_front], config), config)
+@dataclass(frozen=True)
+class _LandmarkVoxels:
+    """The voxels of the ORB points in front of a keyframe's camera."""
+
+    keys: NDArray[np.int64]  # [L]
+    centres_camera: NDArray[np.float64]  # [L, 3]
+    radii_m: NDArray[np.floating]  # of the spheres around them, [L]
+
+    @staticmethod
+    def of(request: SeedRequest, config: AnchorConfig) -> _LandmarkVoxels:
+        """The voxels of a request's landmarks."""
+        T_camera_world = inverse(request.T_world_camera)
+        points = request.landmarks_world.reshape(-1, 3)
+        depths = transform(T_camera_world, points)[:, 2]
+        points, depths = points[depths > 0.0], depths[depths > 0.0]
+        levels = levels_at(depths, config)
+        return _LandmarkVoxels(
+            keys=voxel_keys(points, levels, config),
+            centres_camera=transform(T_camera_world, centres(points, levels, config)),
+            radii_m=sizes_m(levels, config) * math.sqrt(0.75),
+        )
+
+    def pixels(self, camera: Intrinsics) -> NDArray[np.bool_]:
+        """Boxes around the voxels' images: no other pixel has a sample in one of them, [H, W]."""
+        x, y, z = self.centres_camera.T
+        z_least = np.maximum(z - self.radii_m, 1e-3)  # one so close spans the image
+        z = np.maximum(z, z_least)
+        mask = np.zeros((camera.height, camera.width), bool)
+        left, right = _span(x / z, self.radii_m / z_least, camera.fx, camera.cx)
+        top, bottom = _span(y / z, self.radii_m / z_least, camera.fy, camera.cy)
+        for box in zip(top, bottom, left, right, strict=True):
+            mask[box[0] : box[1], box[2] : box[3]] = True
+        return mask
+
+
+def _span(
+    slopes: NDArray[np.floating], radii: NDArray[np.floating], focal: float, centre: float
+) -> tuple[list[int], list[int]]:
+    """First pixel, and one past the last, of spheres that subtend these radii, on one axis."""
+    middle = slopes * focal + centre
+    half = radii * (1.0 + np.abs(slopes)) * focal + 1.0  # a sample may be half a pixel off
+    first = np.maximum(np.floor(middle - half), 0.0).astype(np.int64)
+    end = np.maximum(np.ceil(middle + half) + 1.0, 0.0).astype(np.int64)
+    return first.tolist(), end.tolist()
 
 
 def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generator) -> _Samples:
     """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
     image, camera = request.image, request.image.intrinsics
     depth_m = filled_depth(image.depth_m) if config.fill_holes else image.depth_m
-    rows, columns = np.nonzero(depth_m > 0.0)
-    order = rng.permutation(len(rows))
-    rows, columns = rows[order], columns[order]
-    depths = depth_m[rows, columns]
+    landmarks = _LandmarkVoxels.of(request, config)
+    is_candidate = request.is_uncovered | landmarks.pixels(camera)
+    pixels = rng.permutation(np.flatnonzero(depth_m > 0.0))
     # A sample stands for its whole pixel, whose centre is at the whole number.
-    u = columns + rng.uniform(-0.5, 0.5, len(rows))
-    v = rows + rng.uniform(-0.5, 0.5, len(rows))
+    jitter = rng.uniform(-0.5, 0.5, (2, len(pixels)))
+    kept = np.flatnonzero(is_candidate.ravel()[pixels])
+    rows, columns = np.divmod(pixels[kept], camera.width)
+    u, v = columns + jitter[0, kept], rows + jitter[1, kept]
+    depths = depth_m[rows, columns]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1)
     points = transform(request.T_world_camera, rays * depths[:, None])
     levels = levels_at(depths, config)
     keys = voxel_keys(points, levels, config)
-    is_landmark = np.isin(keys, _landmark_keys(request, config))
+    is_landmark = np.isin(keys, landmarks.keys)
     wanted = np.flatnonzero(request.is_uncovered[rows, columns] | is_landmark)
     wanted = wanted[np.argsort(keys[wanted], kind="stable")]
     return _Samples(

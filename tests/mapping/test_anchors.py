@@ -110,6 +110,21 @@ def test_what_the_map_explains_gets_no_anchor_but_for_orb_points():
     assert new.is_primary.all()
 
 
+def test_orb_points_get_the_same_anchors_whatever_else_the_map_explains():
+    rng = np.random.default_rng(1)
+    image = wall()
+    image.depth_m[:] = rng.uniform(0.3, 6.0, image.depth_m.shape)
+    v, u = rng.integers(0, image.depth_m.shape, (40, 2)).T
+    z = image.depth_m[v, u]
+    slopes = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    landmarks = np.stack([slopes[0] * z, slopes[1] * z, z], 1).astype(np.float64)
+
+    alone, among = seeded(image, landmarks, mask=False), seeded(image, landmarks, mask=True)
+
+    np.testing.assert_array_equal(alone.keys, among.keys[among.is_primary])
+    np.testing.assert_array_equal(alone.scalings, among.scalings[among.is_primary])
+
+
 def test_depth_of_nothing_seeds_nothing():
     assert len(seeded(wall(depth_m=0.0))) == 0
 
