@@ -33,8 +33,13 @@ class Keys:
 
     @staticmethod
     def track(worker: str) -> str:
-        """Queries to one tracking worker."""
+        """Frames for one tracking worker (TrackRequest, TrackResult)."""
         return f"{_ROOT}/track/{worker}/frame"
+
+    @staticmethod
+    def localize(worker: str) -> str:
+        """Single images for one tracking worker (LocalizeRequest, LocalizeResult)."""
+        return f"{_ROOT}/track/{worker}/localize"
 
     @staticmethod
     def mapper(mapper: str, question: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from contextlib import suppress
 from enum import StrEnum
 from functools import cache
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ T = TypeVar("T")
 _ARRAY_CODE = 1
 _DTYPES = {"<f4", "<f8", "|u1", "<u2", "<i4", "<i8", "|b1"}
 _MAX_AXES = 4
+_MAX_SMALL = 64  # elements of a list or map of `unpack_fields`
 _MAX_ELEMENTS = 1 << 20  # of a list or map; arrays are not limited by this
 
 
@@ -53,6 +55,26 @@ def unpack(kind: type[T], data: bytes) -> T:
         reason = f"not a msgpack message ({type(error).__name__}: {error})"
         raise InputError("message", reason) from None
     return from_plain(kind, plain)
+
+
+def unpack_fields(data: bytes, names: tuple[str, ...]) -> dict[str, Any]:
+    """Some fields of a message that may be damaged elsewhere, as plain values; small ones only.
+
+    What is not asked for is skipped and costs no Python values.
+    """
+    unpacker = msgpack.Unpacker(
+        raw=False, max_array_len=_MAX_SMALL, max_map_len=_MAX_SMALL, ext_hook=_unpack_array
+    )
+    found: dict[str, Any] = {}
+    with suppress(ValueError, TypeError, RecursionError, msgpack.UnpackException):
+        unpacker.feed(data)
+        for _ in range(unpacker.read_map_header()):
+            key = unpacker.unpack()
+            if key in names:
+                found[key] = unpacker.unpack()
+            else:
+                unpacker.skip()
+    return found
 
 
 def to_plain(value: Any) -> Any:

@@ -186,11 +186,15 @@ class ContextRequest:
 
 @dataclass(frozen=True)
 class CandidatesRequest:
-    """A worker that lost the camera asks which keyframes look like this frame."""
+    """A worker that lost the camera asks which keyframes look like this frame.
+
+    Where the camera is thought to be somewhere, the keyframe with the nearest view comes first.
+    """
 
     thumbnail: NDArray[np.uint8]  # [15, 20]
     descriptors: NDArray[np.uint8]  # [M, 32]
     limit: int = 5
+    T_world_prior: NDArray[np.float64] | None = None  # [4, 4]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from shared.errors import (
     UnavailableError,
 )
 from shared.frames import HAS_POSE, TrackingStatus
+from shared.localization import LocalizeMessage, LocalizeReply
 from shared.maps import RenderReply
 from shared.se3 import Pose
 from shared.stream import ErrorDetail, FrameMessage, FrameReply
@@ -148,6 +149,17 @@ def track(session: str, message: FrameMessage) -> Call[FrameReply]:
         "POST",
         path_of(session, "/frames"),
         lambda response: codec.unpack(FrameReply, response.content),
+        content=codec.pack(message),
+        headers={"Content-Type": "application/msgpack"},
+    )
+
+
+def localize(session: str, message: LocalizeMessage) -> Call[LocalizeReply]:
+    """Find one image in the session's map."""
+    return Call(
+        "POST",
+        path_of(session, "/localize"),
+        lambda response: codec.unpack(LocalizeReply, response.content),
         content=codec.pack(message),
         headers={"Content-Type": "application/msgpack"},
     )

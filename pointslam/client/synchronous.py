@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,15 +10,10 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from pointslam.client import calls, refinement
-from pointslam.client.frame_stream import stream_frames
-from pointslam.client.messages import FrameOptions, frame_message
-from pointslam.client.progress import POLL_S, Progress, pending
-from shared.camera import Calibration, Intrinsics
+from pointslam.client import calls
+from pointslam.client.session import Session
+from shared.camera import Calibration
 from shared.errors import UnavailableError
-from shared.frames import ColourImage, DepthImage
-from shared.maps import ExportFormat, JobStatus, RenderReply
-from shared.stream import FrameMessage, FrameReply
 
 T = TypeVar("T")
 
@@ -123,168 +117,6 @@ class Client:
                 part.replace(target)
         except httpx.TransportError as error:
             raise _unreachable(self.url, error) from None
-
-
-class Session:
-    """One session; counts its frames."""
-
-    def __init__(self, client: Client, info: dict[str, Any]) -> None:
-        self.name: str = info["session"]
-        self.mode: str = info["mode"]
-        self.next_seq: int = info["tracking"]["last_seq"] + 1
-        self._credit: int = info["tracking"]["credit"]
-        self._client = client
-
-    def frame(
-        self,
-        rgb: NDArray[np.uint8] | ColourImage,
-        depth: NDArray[np.uint16] | DepthImage,
-        t_ns: int,
-        options: FrameOptions | None = None,
-    ) -> FrameMessage:
-        """The next frame, numbered, for `stream`."""
-        self.next_seq += 1
-        return frame_message(self.next_seq - 1, t_ns, rgb, depth, options)
-
-    def track(
-        self,
-        rgb: NDArray[np.uint8] | ColourImage,
-        depth: NDArray[np.uint16] | DepthImage,
-        t_ns: int,
-        *,
-        may_be_keyframe: bool = True,
-        T_odom_camera: NDArray[np.float64] | None = None,
-    ) -> FrameReply:
-        """Send one frame and wait for its pose.
-
-        Args:
-            rgb: colour, [H, W, 3], or an encoded image.
-            depth: raw sensor values, [H, W] (metres are raw / depth_scale), or an encoded image.
-            t_ns: the device's clock, nanoseconds; grows from frame to frame.
-            may_be_keyframe: False keeps the frame out of the map.
-            T_odom_camera: the device's own odometry, [4, 4].
-
-        Raises:
-            PointSlamError: the frame was refused; the session goes on.
-        """
-        options = FrameOptions(may_be_keyframe, T_odom_camera)
-        message = frame_message(self.next_seq, t_ns, rgb, depth, options)
-        reply = self._client.call(calls.track(self.name, message))
-        self.next_seq = message.seq + 1
-        return reply
-
-    def stream(self, frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
-        """Send frames over a WebSocket and yield their replies in order.
-
-        Offline, as many are under way as the gateway gives credit for; live, each is sent when
-        `frames` yields it, and a reply may say SUPERSEDED. A refused frame's reply has `error`.
-
-        Raises:
-            UnavailableError: the connection broke.
-        """
-        url = calls.stream_url(self._client.url, self.name)
-        credit = self._credit if self.mode == "offline" else None
-        for reply in stream_frames(url, frames, credit):
-            self.next_seq = max(self.next_seq, reply.seq + 1)
-            yield reply
-
-    def pose(self, t_ns: int | None = None) -> NDArray[np.float64]:
-        """T_map_camera, [4, 4]: the newest, or at a time, interpolated.
-
-        Raises:
-            NotFoundError: there is no pose (at that time).
-        """
-        return self._client.call(calls.pose(self.name, t_ns))
-
-    def poses(self, kind: str = "final") -> list[tuple[int, NDArray[np.float64]]]:
-        """(t_ns, T_map_camera) of every tracked frame, `online` as told or `final` as of now."""
-        return calls.poses_of(self.trajectory(), kind)
-
-    def trajectory(self) -> list[calls.TrajectoryRecord]:
-        """Every answered frame."""
-        return self._client.call(calls.trajectory(self.name))
-
-    def render(
-        self,
-        T_world_camera: NDArray[np.float64],
-        intrinsics: Intrinsics | None = None,
-        appearance_t_ns: int | None = None,
-    ) -> RenderReply:
-        """A view of the map; without intrinsics, through the session's colour camera."""
-        return self._client.call(
-            calls.render(self.name, T_world_camera, intrinsics, appearance_t_ns)
-        )
-
-    def info(self) -> dict[str, Any]:
-        """State of the map (fields of MapInfo) and of tracking."""
-        return self._client.call(calls.info(self.name))
-
-    def refine(self, iterations: int, progress: Progress | None = None) -> JobStatus:
-        """Optimise the map on all keyframes; returns when it is done or interrupted.
-
-        Raises:
-            PointSlamError: the refinement failed.
-        """
-        job = self.start_refinement(iterations)
-        for job in self.refinement_events():
-            if progress is not None:
-                progress(job.iterations_done, job.iterations_total)
-        return refinement.succeeded(job)
-
-    def start_refinement(self, iterations: int) -> JobStatus:
-        """Start to optimise the map on all keyframes; it goes on without this client.
-
-        Raises:
-            ConflictError: a refinement is running.
-        """
-        return self._client.call(refinement.start(self.name, iterations))
-
-    def refinement_events(self) -> Iterator[JobStatus]:
-        """The present or the last refinement whenever it has moved, until it has ended.
-
-        Raises:
-            NotFoundError: the session was never refined.
-        """
-        is_running, path = True, refinement.events_path(self.name)
-        while is_running:
-            try:
-                for job in filter(None, map(refinement.job_in, self._client.lines(path))):
-                    is_running = job.is_running
-                    yield job
-            except UnavailableError:
-                time.sleep(POLL_S)  # the stream broke; the call below says whether the gateway did
-                is_running = self._client.call(refinement.status(self.name)).is_running
-
-    def refinement(self) -> JobStatus:
-        """The present or the last refinement."""
-        return self._client.call(refinement.status(self.name))
-
-    def interrupt(self) -> JobStatus:
-        """End a refinement; a live map rests until the next frame."""
-        return self._client.call(refinement.interrupt(self.name))
-
-    def wait_until_mapped(self, progress: Progress | None = None) -> None:
-        """Wait until the map has worked through every answered frame."""
-        most = left = pending(self.info())
-        while left > 0:
-            time.sleep(POLL_S)
-            left = pending(self.info())
-            most = max(most, left)
-            if progress is not None:
-                progress(most - left, most)
-
-    def save(self) -> dict[str, Any]:
-        """Write a snapshot; returns when it is on disk."""
-        return self._client.call(calls.save(self.name))
-
-    def export(self, format: ExportFormat | str, path: Path | str) -> None:
-        """The map as a file: ply (splats), mesh or snapshot."""
-        params = {"format": str(ExportFormat(format))}
-        self._client.download(calls.export_path(self.name), params, Path(path))
-
-    def delete(self) -> None:
-        """Remove the session and every byte of it."""
-        self._client.call(calls.delete(self.name))
 
 
 def _unreachable(url: str, error: Exception) -> UnavailableError:

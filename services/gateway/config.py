@@ -23,10 +23,16 @@ class LimitsConfig:
     max_refine_iterations: int = 1_000_000
     max_connections: int = 512
     max_waiting_frames: int = 8  # of one offline session, beyond what its credits allow
+    max_localizations: int = 8  # single images of one session that are searched for at a time
 
     def __post_init__(self) -> None:
         _check_positive(
-            self, "max_message_bytes", "max_render_pixels", "max_connections", "max_waiting_frames"
+            self,
+            "max_message_bytes",
+            "max_render_pixels",
+            "max_connections",
+            "max_waiting_frames",
+            "max_localizations",
         )
 
 

@@ -18,9 +18,9 @@ from services.gateway.errors import MESSAGE, TooLargeError
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import InputError
-from shared.frames import ColourEncoding, DepthEncoding
+from shared.frames import ColourEncoding, ColourImage, DepthEncoding
 from shared.se3 import Pose
-from shared.stream import FLAGS, FrameMessage
+from shared.stream import FLAGS, DepthMessage, FrameMessage
 
 T = TypeVar("T")
 
@@ -45,9 +45,7 @@ def read_frame(data: bytes, calibration: Calibration) -> FrameMessage:
             content would cost 70 times its size as Python values.
         InputError: names the field.
     """
-    limit = _max_bytes(calibration)
-    if len(data) > limit:
-        raise TooLargeError(MESSAGE, f"must be at most {limit} bytes for this calibration")
+    check_size_of(data, calibration)
     message = named_from(FrameMessage, codec.unpack, data)
     check_frame(message, calibration)
     return message
@@ -69,6 +67,13 @@ def read_numbers(data: bytes) -> tuple[int, int]:
             elif type(number := unpacker.unpack()) is int:
                 found[key] = number
     return found["seq"], found["t_ns"]
+
+
+def check_size_of(data: bytes, calibration: Calibration) -> None:
+    """Refuse a message that is longer than its images could be, with a TooLargeError."""
+    limit = _max_bytes(calibration)
+    if len(data) > limit:
+        raise TooLargeError(MESSAGE, f"must be at most {limit} bytes for this calibration")
 
 
 def _max_bytes(calibration: Calibration) -> int:
@@ -102,16 +107,19 @@ def check_frame(message: FrameMessage, calibration: Calibration) -> None:
     for flag in message.flags:
         if flag not in FLAGS:
             raise InputError("flags", f"unknown flag {flag[:40]!r}; known: {', '.join(FLAGS)}")
-    scale = message.depth.scale
-    if scale is not None and scale != calibration.depth_scale:
-        raise InputError(
-            "depth.scale", f"is {scale}, the calibration says {calibration.depth_scale}"
-        )
+    check_scale(message.depth, calibration)
     if message.prior is not None:
         matrix_of(message.prior.T_odom_camera, "prior.T_odom_camera")
-    _check_colour(message.rgb.encoding, message.rgb.bytes, calibration.colour.intrinsics)
-    size = calibration.depth_camera().intrinsics
-    _check_depth(message.depth.encoding, message.depth.bytes, size)
+    check_colour(message.rgb, calibration.colour.intrinsics)
+    check_depth(message.depth, calibration.depth_camera().intrinsics)
+
+
+def check_scale(depth: DepthMessage, calibration: Calibration) -> None:
+    """Refuse depth in other units than the calibration's, with an InputError."""
+    if depth.scale is not None and depth.scale != calibration.depth_scale:
+        raise InputError(
+            "depth.scale", f"is {depth.scale}, the calibration says {calibration.depth_scale}"
+        )
 
 
 def _check_range(field: str, value: int, limit: int) -> None:
@@ -136,8 +144,9 @@ def matrix_of(pose: Pose, field: str) -> NDArray[np.float64]:
     return T
 
 
-def _check_colour(encoding: ColourEncoding, data: bytes, size: Intrinsics) -> None:
-    field = "rgb.bytes"
+def check_colour(image: ColourImage, size: Intrinsics) -> None:
+    """Refuse a colour image by its header, with an InputError."""
+    field, encoding, data = "rgb.bytes", image.encoding, image.bytes
     if encoding is ColourEncoding.RGB8:
         _check_length(data, 3 * size.width * size.height, field)
     elif encoding is ColourEncoding.JPEG:
@@ -150,8 +159,10 @@ def _check_colour(encoding: ColourEncoding, data: bytes, size: Intrinsics) -> No
             )
 
 
-def _check_depth(encoding: DepthEncoding, data: bytes, size: Intrinsics) -> None:
-    field, rows = "depth.bytes", 2 * size.width * size.height
+def check_depth(image: DepthMessage, size: Intrinsics) -> None:
+    """Refuse a depth image by its header or length, with an InputError."""
+    field, encoding, data = "depth.bytes", image.encoding, image.bytes
+    rows = 2 * size.width * size.height
     if encoding is DepthEncoding.RAW16:
         _check_length(data, rows, field)
     elif encoding is DepthEncoding.ZLIB16:

@@ -11,8 +11,9 @@ import hashlib
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from services.gateway.config import DispatchConfig
 from services.gateway.members import Members
@@ -20,6 +21,7 @@ from services.gateway.metrics import QUARANTINES, RETRIES
 from shared.bus import Bus, Keys
 from shared.errors import GoneError, TimedOutError, UnavailableError
 from shared.frames import TrackRequest
+from shared.localization import LocalizeRequest, LocalizeResult
 from shared.tracks import TrackResult
 
 LOGGER = logging.getLogger(__name__)
@@ -49,7 +51,7 @@ class _Seat:
 
 
 class TrackerPool:
-    """Asks one worker at a time for each session's frames."""
+    """Asks one worker at a time for each session's frames and single images."""
 
     def __init__(self, bus: Bus, members: Members, config: DispatchConfig) -> None:
         self._bus = bus
@@ -59,12 +61,28 @@ class TrackerPool:
         self._quarantined: dict[str, float] = {}  # until when, monotonic seconds
 
     async def track(self, request: TrackRequest, timeout_s: float, wait_s: float) -> TrackResult:
-        """The answer of some worker; waits `wait_s` for one to be there.
+        """The answer of some worker to a frame; waits `wait_s` for one to be there.
 
         Raises:
             UnavailableError: no worker answers.
             PointSlamError: what the worker raised.
         """
+        return await self._ask(Keys.track, request, TrackResult, (timeout_s, wait_s))
+
+    async def localize(
+        self, request: LocalizeRequest, timeout_s: float, wait_s: float
+    ) -> LocalizeResult:
+        """The answer of some worker to a single image; see `track`."""
+        return await self._ask(Keys.localize, request, LocalizeResult, (timeout_s, wait_s))
+
+    async def _ask(
+        self,
+        key_of: Callable[[str], str],
+        request: TrackRequest | LocalizeRequest,
+        kind: type,
+        times_s: tuple[float, float],
+    ) -> Any:
+        timeout_s, wait_s = times_s
         failed: set[str] = set()
         deadline = time.monotonic() + wait_s
         while True:
@@ -74,10 +92,10 @@ class TrackerPool:
                 limit = max(timeout_s, self._config.first_frame_timeout_s)
             self._seats[request.session] = _Seat(worker, time.monotonic())
             try:
-                return await self._bus.ask(Keys.track(worker), request, TrackResult, limit)
+                return await self._bus.ask(key_of(worker), request, kind, limit)
             except GoneError:
                 RETRIES.labels("gone").inc()
-                LOGGER.warning("tracking worker %s is gone; frame %d", worker, request.frame.seq)
+                LOGGER.warning("tracking worker %s is gone; asked by %s", worker, request.session)
             except TimedOutError:
                 LOGGER.warning("tracking worker %s timed out after %.1f s", worker, limit)
                 self._quarantined[worker] = time.monotonic() + self._config.quarantine_s

@@ -56,6 +56,58 @@ POST_FRAME: dict[str, Any] = {
     }
 }
 
+_COVARIANCE = [5e-6 if i % 7 == 0 else 0.0 for i in range(36)]
+
+LOCALIZE: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": (
+            "A msgpack map: rgb {encoding, bytes}, depth? {encoding, bytes, scale?}, "
+            "T_map_camera_prior? {position, orientation} (where the camera is thought to be), and "
+            "for another device than the session's its calibration? or, for colour alone, its "
+            'camera? {"intrinsics": {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
+            '"width": 640, "height": 480}, "distortion": []}. Images as in POST .../frames.'
+        ),
+        "content": {"application/msgpack": {"schema": {"type": "string", "format": "binary"}}},
+    },
+    "responses": {
+        "200": {
+            "content": {
+                "application/json": {
+                    "examples": {
+                        "found": {
+                            "value": {
+                                "status": "LOCALISED",
+                                "reason": "",
+                                "T_map_camera": {
+                                    "position": {"x": 0.4, "y": -0.1, "z": 1.9},
+                                    "orientation": {"x": 0.0, "y": 0.38, "z": 0.0, "w": 0.92},
+                                },
+                                "pos_std_m": 0.004,
+                                "rot_std_deg": 0.1,
+                                "covariance": _COVARIANCE,
+                                "inliers": 412,
+                                "inlier_share": 0.93,
+                                "reference_seq": 120,
+                                "map_revision": 58,
+                                "timings_ms": {"orb": 9.1, "total": 52.0},
+                            }
+                        },
+                        "not found": {
+                            "value": {
+                                "status": "NOT_LOCALISED",
+                                "reason": "no keyframe looks like this",
+                                "T_map_camera": None,
+                                "map_revision": 58,
+                            }
+                        },
+                    }
+                }
+            }
+        }
+    },
+}
+
 REFINE: dict[str, Any] = {
     "requestBody": {
         "required": True,

@@ -12,6 +12,7 @@ import grpc
 from services.gateway.decode import UNKNOWN, check_frame
 from services.gateway.errors import detail, grpc_status
 from services.gateway.frame_stream import FrameStream, SlowClientError
+from services.gateway.localizer import check_localize
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import CreateRequest, Sessions
@@ -21,6 +22,8 @@ from services.gateway.wire_values import (
     chosen,
     frame_from,
     intrinsics_from,
+    localize_from,
+    localized_to,
     matrix_from,
     pose_from,
     reply_to,
@@ -175,6 +178,14 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
                 await stream.run(read)
             except SlowClientError:
                 await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "replies are not read")
+
+    async def Localize(self, request: Any, context: Any) -> Any:
+        """Find one image in a session's map."""
+        async with _refusing(context):
+            session = await self._sessions.get(request.session_id)
+            message = localize_from(request)
+            check_localize(message, session.calibration)
+            return localized_to(await session.localize(message))
 
 
 def _frame(request: Any, session: Session) -> Any:

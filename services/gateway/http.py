@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse, Response
 from services.gateway import examples
 from services.gateway.decode import plain, read_frame
 from services.gateway.errors import MESSAGE
+from services.gateway.localizer import read_localize
 from services.gateway.poses import TimedPose
 from services.gateway.sessions import CreateRequest, Sessions
 from services.gateway.trajectory import fetch_trajectory, trajectory_json, trajectory_tum
@@ -59,10 +60,18 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
         """Track one frame: a msgpack FrameMessage in, a FrameReply out (JSON if accepted)."""
         session = await sessions.get(name)
         message = read_frame(await request.body(), session.calibration)
-        reply = await session.track(message)
-        if "json" in request.headers.get("accept", ""):
-            return JSONResponse(codec.to_json(reply))
-        return Response(codec.pack(reply), media_type=MSGPACK)
+        return _reply(request, await session.track(message))
+
+    @router.post("/v1/sessions/{name}/localize", openapi_extra=examples.LOCALIZE)
+    async def localize(name: str, request: Request) -> Response:
+        """Find one image in the map: a msgpack LocalizeMessage in, a LocalizeReply out (or JSON).
+
+        The map may be of any time; the session's trajectory is not touched. `NOT_LOCALISED` says
+        in `reason` why there is no pose, `COLOUR_ONLY` that no depth could confirm it.
+        """
+        session = await sessions.get(name)
+        message = read_localize(await request.body(), session.calibration)
+        return _reply(request, await session.localize(message))
 
 
 def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
@@ -121,6 +130,13 @@ def pose_json(pose: TimedPose) -> dict[str, Any]:
         "map_revision": pose.map_revision,
         "is_interpolated": pose.is_interpolated,
     }
+
+
+def _reply(request: Request, reply: object) -> Response:
+    """Msgpack, or JSON where that is accepted."""
+    if "json" in request.headers.get("accept", ""):
+        return JSONResponse(codec.to_json(reply))
+    return Response(codec.pack(reply), media_type=MSGPACK)
 
 
 async def _json(request: Request) -> Any:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from services.gateway.config import GatewayConfig
 from services.gateway.dispatch import TrackerPool
@@ -27,6 +27,7 @@ from shared.maps import Empty
 from shared.tracks import Advance, AdvanceReply, KeyframePoses, OpenReply, OpenRequest
 
 LOGGER = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,24 @@ class MapOwner:
                 await self.reopen(epoch, deadline)
             except TimedOutError:
                 if self.mapper in self._fabric.mappers.names:
+                    raise
+                await self.reopen(epoch, deadline)
+
+    async def ask_tracker(self, ask: Callable[[], Awaitable[T]], wait_s: float) -> T:
+        """Ask a tracking worker, and again after opening a map whose owner it could not reach.
+
+        Raises:
+            PointSlamError: what the worker raised.
+            UnavailableError: no worker, or no mapper, in `wait_s` seconds.
+        """
+        deadline = time.monotonic() + wait_s
+        while True:
+            epoch = self.epoch
+            try:
+                return await ask()
+            except UnavailableError:
+                # The worker could not reach the map's owner, or no worker is there at all.
+                if time.monotonic() >= deadline:
                     raise
                 await self.reopen(epoch, deadline)
 

@@ -9,11 +9,13 @@ from typing import Any
 
 from services.gateway.delivery import Delivery
 from services.gateway.frame_queue import FrameQueue, Outcome
+from services.gateway.localizer import Localizer
 from services.gateway.owner import Fabric, MapOwner
 from services.gateway.poses import PoseRing, TimedPose, deviations, record_of
 from services.gateway.prior import next_prior, resumed_prior
-from shared.errors import PointSlamError, UnavailableError
+from shared.errors import PointSlamError
 from shared.frames import HAS_POSE, Frame, TrackRequest
+from shared.localization import LocalizeMessage, LocalizeReply
 from shared.se3 import Pose
 from shared.stream import FrameMessage, FrameReply
 from shared.tracks import Advance, OpenReply, TrackResult
@@ -43,6 +45,7 @@ class Session:
         waiting = fabric.config.limits.max_waiting_frames
         self._frames = FrameQueue(self._answer, self.is_live, waiting, newest)
         self._newest = newest
+        self._localizer = Localizer(fabric, self.owner, self.calibration)
         self._watchers: set[asyncio.Queue[TimedPose]] = set()
 
     def submit(self, message: FrameMessage) -> asyncio.Future[Outcome]:
@@ -59,6 +62,24 @@ class Session:
         if isinstance(outcome, PointSlamError):
             raise outcome
         return outcome
+
+    async def localize(self, message: LocalizeMessage) -> LocalizeReply:
+        """Find a checked image in the map; no frame of the session waits for it.
+
+        Raises:
+            PointSlamError: the image was refused.
+            UnavailableError: too many are under way.
+        """
+        return await self._localizer.localize(message, self.map_revision)
+
+    @property
+    def map_revision(self) -> int:
+        """The revision to track in.
+
+        Offline runs repeat exactly, so they use the one that the last reply told, never one heard
+        by chance.
+        """
+        return self.owner.revision if self.is_live else self.owner.acknowledged_revision
 
     def pose(self, t_ns: int | None = None) -> TimedPose:
         """The newest pose, or the pose at a time.
@@ -123,25 +144,18 @@ class Session:
         dispatch = self._fabric.config.dispatch
         timeout_s = dispatch.live_timeout_s if self.is_live else dispatch.offline_timeout_s
         wait_s = dispatch.live_wait_s if self.is_live else dispatch.offline_wait_s
-        deadline = time.monotonic() + wait_s
-        while True:
-            epoch = self.owner.epoch
-            try:
-                return await self._fabric.trackers.track(self._request(frame), timeout_s, wait_s)
-            except UnavailableError:
-                # The worker could not reach the map's owner, or no worker is there at all.
-                if time.monotonic() >= deadline:
-                    raise
-                await self.owner.reopen(epoch, deadline)
+        trackers = self._fabric.trackers
+
+        async def ask() -> TrackResult:
+            return await trackers.track(self._request(frame), timeout_s, wait_s)
+
+        return await self.owner.ask_tracker(ask, wait_s)
 
     def _request(self, frame: Frame) -> TrackRequest:
-        # Offline runs repeat exactly, so they use the revision that the last reply told, never
-        # one heard by chance.
-        owner = self.owner
         return TrackRequest(
             session=self.name,
-            epoch=owner.epoch,
-            map_revision=owner.revision if self.is_live else owner.acknowledged_revision,
+            epoch=self.owner.epoch,
+            map_revision=self.map_revision,
             calibration=self.calibration,
             frame=frame,
             prior=self._prior,

@@ -12,6 +12,7 @@ from services.gateway.poses import TimedPose
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.errors import InputError
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
+from shared.localization import LocalizationStatus, LocalizeMessage, LocalizeReply
 from shared.se3 import Pose, Quaternion, Vector3
 from shared.stream import DepthMessage, FrameMessage, FrameReply, PriorMessage
 from shared.wire import pose_service_pb2, tracking_service_pb2, types_pb2
@@ -35,6 +36,11 @@ _STATUSES: dict[TrackingStatus | None, types_pb2.TrackingStatus] = {
     TrackingStatus.LOST: types_pb2.TRACKING_STATUS_LOST,
     TrackingStatus.SUPERSEDED: types_pb2.TRACKING_STATUS_SUPERSEDED,
     TrackingStatus.NEED_FRAMES: types_pb2.TRACKING_STATUS_NEED_FRAMES,
+}
+_LOCALIZATIONS = {
+    LocalizationStatus.LOCALISED: tracking_service_pb2.LOCALIZATION_STATUS_LOCALISED,
+    LocalizationStatus.COLOUR_ONLY: tracking_service_pb2.LOCALIZATION_STATUS_COLOUR_ONLY,
+    LocalizationStatus.NOT_LOCALISED: tracking_service_pb2.LOCALIZATION_STATUS_NOT_LOCALISED,
 }
 
 
@@ -118,20 +124,60 @@ def calibration_from(message: types_pb2.Calibration) -> Calibration:
 
 def frame_from(message: tracking_service_pb2.Frame) -> FrameMessage:
     """A frame; its images are not checked here."""
-    depth, prior = message.depth, None
+    prior = None
     if message.HasField("prior"):
         prior = PriorMessage(pose_from(require(message.prior, "T_odom_camera", "prior.")))
     return FrameMessage(
         seq=message.seq,
         t_ns=message.t_ns,
-        rgb=ColourImage(chosen(message.rgb.encoding, _COLOUR, "rgb.encoding"), message.rgb.bytes),
-        depth=DepthMessage(
-            chosen(depth.encoding, _DEPTH, "depth.encoding"),
-            depth.bytes,
-            depth.scale if depth.HasField("scale") else None,
-        ),
+        rgb=_colour_from(message.rgb),
+        depth=_depth_from(message.depth),
         prior=prior,
         flags=tuple(message.flags),
+    )
+
+
+def _colour_from(message: tracking_service_pb2.ColourImage) -> ColourImage:
+    return ColourImage(chosen(message.encoding, _COLOUR, "rgb.encoding"), message.bytes)
+
+
+def _depth_from(message: tracking_service_pb2.DepthImage) -> DepthMessage:
+    return DepthMessage(
+        chosen(message.encoding, _DEPTH, "depth.encoding"),
+        message.bytes,
+        message.scale if message.HasField("scale") else None,
+    )
+
+
+def localize_from(message: tracking_service_pb2.LocalizeRequest) -> LocalizeMessage:
+    """A single image; it is not checked here."""
+    optional: dict[str, Any] = {}
+    if message.HasField("depth"):
+        optional["depth"] = _depth_from(message.depth)
+    if message.HasField("T_map_camera_prior"):
+        optional["T_map_camera_prior"] = pose_from(message.T_map_camera_prior)
+    if message.HasField("calibration"):
+        optional["calibration"] = calibration_from(message.calibration)
+    if message.HasField("camera"):
+        optional["camera"] = _camera_from(message.camera, "camera.")
+    return LocalizeMessage(_colour_from(require(message, "rgb")), **optional)
+
+
+def localized_to(reply: LocalizeReply) -> tracking_service_pb2.LocalizeResponse:
+    """The answer to a single image."""
+    pose = reply.T_map_camera
+    return tracking_service_pb2.LocalizeResponse(
+        status=_LOCALIZATIONS[reply.status],
+        reason=reply.reason,
+        T_map_camera=_pose_message(pose) if pose else None,
+        pos_std_m=reply.pos_std_m,
+        rot_std_deg=reply.rot_std_deg,
+        covariance=reply.covariance,
+        inliers=reply.inliers,
+        inlier_share=reply.inlier_share,
+        reference_seq=reply.reference_seq,
+        map_revision=reply.map_revision,
+        timings_ms=reply.timings_ms,
     )
 
 

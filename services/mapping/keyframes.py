@@ -29,7 +29,7 @@ from services.mapping.loop_candidates import loop_candidates
 from services.mapping.loop_closing import LoopCloser
 from services.mapping.loop_config import LoopConfig
 from services.mapping.loops import Poses, SeenLoop
-from services.mapping.retrieval import RetrievalConfig, rank_keyframes
+from services.mapping.retrieval import RetrievalConfig, nearest_view, rank_keyframes
 from shared.errors import ConflictError, NotFoundError
 from shared.se3 import rotate
 from shared.tracks import (
@@ -215,9 +215,11 @@ class KeyframeStore:
             list(self._keyframes.values()),
             self._config.retrieval,
         )
-        return Candidates(
-            self.revision, tuple(self._candidate(k) for k in ranked[: max(0, request.limit)])
-        )
+        chosen = ranked[: max(0, request.limit)]
+        if request.T_world_prior is not None:
+            expected = nearest_view(request.T_world_prior, ranked)
+            chosen = [expected, *(k for k in chosen if k.seq != expected.seq)]
+        return Candidates(self.revision, tuple(self._candidate(k) for k in chosen))
 
     def _candidate(self, keyframe: StoredKeyframe) -> Candidate:
         landmarks = landmarks_seen(self._landmarks, [keyframe], self._known_ids(keyframe))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from services.mapping.context import StoredKeyframe
 from shared.errors import ConfigError
+from shared.se3 import angle_rad, inverse
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,18 @@ def count_alike(
     """How many ORB descriptors [M, 32] have a near one among others [N, 32]."""
     query, stored = _packed(descriptors, max_descriptors), _packed(others, max_descriptors)
     return int(_count_near(query, stored, max_hamming_bits))
+
+
+def nearest_view(
+    T_world_camera: NDArray[np.float64], keyframes: list[StoredKeyframe]
+) -> StoredKeyframe:
+    """The keyframe whose view differs least: a radian counts as much as the depth it looks at."""
+
+    def difference(keyframe: StoredKeyframe) -> float:
+        step = inverse(keyframe.T_world_camera) @ T_world_camera
+        return float(np.linalg.norm(step[:3, 3])) + keyframe.cone.far_m * angle_rad(step)
+
+    return min(keyframes, key=difference)
 
 
 def thumbnail_correlation(

@@ -20,6 +20,7 @@ from services.tracking.warm_up import warm_up  # noqa: E402
 from services.tracking.worker import Worker  # noqa: E402
 from shared.bus import Keys, open_bus  # noqa: E402
 from shared.frames import TrackRequest  # noqa: E402
+from shared.localization import LocalizeRequest  # noqa: E402
 from shared.metrics import add_metrics_arguments, serve_metrics  # noqa: E402
 from shared.service import (  # noqa: E402
     announce_ready,
@@ -50,9 +51,11 @@ def main(argv: list[str]) -> None:
     with (
         open_bus(endpoints(arguments)) as bus,
         ThreadPoolExecutor(config.concurrent_frames, "frame") as executor,
+        ThreadPoolExecutor(1, "localize") as beside,  # no frame waits for a search of the map
     ):
         worker = Worker(bus, config)
         bus.serve(Keys.track(arguments.id), TrackRequest, worker.answer, executor)
+        bus.serve(Keys.localize(arguments.id), LocalizeRequest, worker.localize, beside)
         bus.declare_alive("tracking", arguments.id)
         announce_ready(arguments.id)
         stop.wait()

@@ -134,6 +134,10 @@ class RelocalizationConfig:
     iterations: int = 2000
     max_candidates: int = 5
     seed: int = 0
+    spread_inliers: int = 40  # fewer than verification.sure_inliers will do where they lie in
+    spread_cells: int = 8  # so many of 16 cells of the image: a repeated object fills fewer
+    spread_inliers_colour: int = 80  # without depth to confirm them
+    min_inlier_share_colour: float = 0.5
 
 
 @dataclass(frozen=True)

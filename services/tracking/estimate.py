@@ -57,6 +57,14 @@ class Estimate:
         return ids
 
 
+def pose_covariance(
+    information: NDArray[np.float64], config: TrackingConfig
+) -> NDArray[np.float64]:
+    """Inverse of the information; what nothing is known of gets a metre or a radian, [6, 6]."""
+    weakened = information / config.verification.covariance_scale
+    return np.asarray(np.linalg.inv(weakened + np.eye(6)), np.float64)
+
+
 def attempt(
     observed: Observed,
     local: LocalMap,

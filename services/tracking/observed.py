@@ -18,10 +18,19 @@ from services.tracking.config import TrackingConfig
 from services.tracking.orb import Features, Keypoints, detect, with_depth
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.stopwatch import Stopwatch
-from shared.camera import Intrinsics
-from shared.frames import TrackRequest
+from shared.camera import Calibration, Intrinsics
+from shared.frames import ColourImage, DepthImage
 from shared.rectify import RgbdImage, rectify_colour, rectify_depth
 from shared.tracks import PointCloud
+
+
+@dataclass(frozen=True)
+class EncodedImages:
+    """What a device sent; without depth there is no surface, and no feature has depth."""
+
+    rgb: ColourImage
+    depth: DepthImage | None
+    calibration: Calibration
 
 
 @dataclass(frozen=True)
@@ -70,25 +79,32 @@ class Observed:
 
 
 def observe(
-    request: TrackRequest, config: TrackingConfig, clock: Stopwatch, helper: Executor
+    images: EncodedImages, config: TrackingConfig, clock: Stopwatch, helper: Executor
 ) -> Observed:
-    """Decode a frame and find its surface, while the helper finds its features.
+    """Decode images and find their surface, while the helper finds their features.
 
     Raises:
         InputError: the depth image cannot be decoded.
     """
-    frame, calibration = request.frame, request.calibration
+    calibration = images.calibration
 
     def look() -> Appearance:
         with clock.stage("decode_colour"):
-            rgb = rectify_colour(frame.rgb, calibration)
+            rgb = rectify_colour(images.rgb, calibration)
         with clock.stage("orb"):
             return Appearance(rgb, detect(rgb, config.orb))
 
     appearance = helper.submit(look)
     with clock.stage("decode_depth"):
-        depth_m = rectify_depth(frame.depth, calibration)
+        depth_m = _depth(images)
     intrinsics = calibration.colour.intrinsics
     with clock.stage("points"):
         cloud = surface_from_depth(depth_m, intrinsics, config.surface)
     return Observed(depth_m, intrinsics, cloud, appearance, config)
+
+
+def _depth(images: EncodedImages) -> NDArray[np.float32]:
+    if images.depth is not None:
+        return rectify_depth(images.depth, images.calibration)
+    size = images.calibration.colour.intrinsics
+    return np.zeros((size.height, size.width), np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.estimate import Estimate
+from services.tracking.estimate import Estimate, pose_covariance
 from services.tracking.executors import NoHelper
 from services.tracking.keyframes import (
     Coverage,
@@ -28,7 +28,7 @@ from services.tracking.keyframes import (
 )
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.loop_verification import find_loop
-from services.tracking.observed import Observed, observe
+from services.tracking.observed import EncodedImages, Observed, observe
 from services.tracking.prediction import brought_up
 from services.tracking.search import Found, Job, search
 from services.tracking.sharpness import edge_blur_px
@@ -59,7 +59,8 @@ def track(
         InputError: an image cannot be decoded; names the field.
     """
     clock = Stopwatch()
-    observed = observe(request, config, clock, helper)
+    images = EncodedImages(request.frame.rgb, request.frame.depth, request.calibration)
+    observed = observe(images, config, clock, helper)
     job = Job(request, observed, source, config, clock)
     with clock.stage("context"):
         local = source.local_map(request.prior.reference_seq if request.prior else -1)
@@ -149,7 +150,7 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
     coverage = _coverage(observed, estimate)
-    if not is_well_known(_covariance(estimate.information, config), config.keyframe):
+    if not is_well_known(pose_covariance(estimate.information, config), config.keyframe):
         return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
         return None
@@ -202,7 +203,7 @@ def _answer(job: Job, found: Found, keyframe: KeyframeData | None) -> TrackResul
         t_ns=frame.t_ns,
         status=found.status,
         T_world_camera=T,
-        covariance=_covariance(estimate.information, job.config),
+        covariance=pose_covariance(estimate.information, job.config),
         reference_seq=reference_seq,
         T_reference_camera=inverse(T_world_reference) @ T,
         inliers=estimate.inliers,
@@ -227,9 +228,3 @@ def _reference(job: Job, estimate: Estimate) -> tuple[int, NDArray[np.float64]]:
         [(keyframe.seq, keyframe.T_world_camera) for keyframe in context.window],
         _median_depth(job.observed),
     )
-
-
-def _covariance(information: NDArray[np.float64], config: TrackingConfig) -> NDArray[np.float64]:
-    """Inverse of the information; what nothing is known of gets a metre or a radian."""
-    weakened = information / config.verification.covariance_scale
-    return np.asarray(np.linalg.inv(weakened + np.eye(6)), np.float64)

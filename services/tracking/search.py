@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig, VerificationConfig
 from services.tracking.estimate import Estimate, attempt
-from services.tracking.keyframes import thumbnail_of
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.observed import Observed
 from services.tracking.prediction import predict
-from services.tracking.relocalization import locate
+from services.tracking.relocalization import Recovery, is_found, locate, recover
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Step, is_possible_step, step_between
 from shared.frames import TrackingStatus, TrackRequest
-from shared.tracks import CandidatesRequest
 
 
 @dataclass(frozen=True)
@@ -157,20 +155,16 @@ def is_coarse(
 
 
 def _relocalise(job: Job) -> Found:
-    """Ask the map for keyframes that look alike; PnP against each, then a full attempt."""
-    request = CandidatesRequest(
-        thumbnail=thumbnail_of(job.observed.image.rgb),
-        descriptors=job.observed.features.descriptors,
-        limit=job.config.relocalization.max_candidates,
+    """Find the camera anywhere in the map; a frame after the break must be beyond doubt."""
+    recovered = recover(
+        Recovery(
+            observed=job.observed,
+            source=job.source,
+            config=job.config,
+            clock=job.clock,
+            is_believed=lambda estimate: is_found(job.observed, estimate, job.config),
+        )
     )
-    with job.clock.stage("relocalization"):
-        candidates = job.source.candidates(request)
-    for candidate in candidates.keyframes:
-        local = job.source.local_map(candidate.seq)
-        T_start = job.locate(local)
-        if T_start is None:
-            continue
-        estimate = job.attempt(local, T_start)
-        if is_sure(estimate, job.config.verification):
-            return Found(TrackingStatus.RELOCALISED, estimate)
+    if recovered.is_believed:
+        return Found(TrackingStatus.RELOCALISED, recovered.estimate)
     return Found(TrackingStatus.LOST, None)

@@ -10,9 +10,11 @@ from typing import Any
 from services.tracking import metrics
 from services.tracking.config import TrackingConfig
 from services.tracking.local_map import LocalMap, derive
+from services.tracking.localization import localize
 from services.tracking.pipeline import track
 from shared.bus import Bus, Keys
 from shared.frames import TrackRequest
+from shared.localization import LocalizeRequest, LocalizeResult
 from shared.tracks import (
     Candidates,
     CandidatesRequest,
@@ -56,7 +58,11 @@ class BusSource:
     """The owner of one session's map, asked over the bus."""
 
     def __init__(
-        self, bus: Bus, request: TrackRequest, cache: ContextCache, config: TrackingConfig
+        self,
+        bus: Bus,
+        request: TrackRequest | LocalizeRequest,
+        cache: ContextCache,
+        config: TrackingConfig,
     ) -> None:
         self._bus = bus
         self._request = request
@@ -100,7 +106,7 @@ class BusSource:
 
 
 class Worker:
-    """Answers frames of any session."""
+    """Answers frames and single images of any session."""
 
     def __init__(self, bus: Bus, config: TrackingConfig) -> None:
         self._bus = bus
@@ -122,3 +128,13 @@ class Worker:
         result = track(request, source, self._config, self._helpers)
         metrics.count(result)
         return result
+
+    def localize(self, request: LocalizeRequest) -> LocalizeResult:
+        """Find one image in a session's map.
+
+        Raises:
+            InputError, UnavailableError: as `answer`.
+        """
+        request.calibration.check()
+        source = BusSource(self._bus, request, self._cache, self._config)
+        return localize(request, source, self._config, self._helpers)

@@ -21,6 +21,13 @@ class DepthEncoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     DEPTH_ENCODING_PNG16: _ClassVar[DepthEncoding]
     DEPTH_ENCODING_RAW16: _ClassVar[DepthEncoding]
     DEPTH_ENCODING_ZLIB16: _ClassVar[DepthEncoding]
+
+class LocalizationStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    LOCALIZATION_STATUS_UNSPECIFIED: _ClassVar[LocalizationStatus]
+    LOCALIZATION_STATUS_LOCALISED: _ClassVar[LocalizationStatus]
+    LOCALIZATION_STATUS_COLOUR_ONLY: _ClassVar[LocalizationStatus]
+    LOCALIZATION_STATUS_NOT_LOCALISED: _ClassVar[LocalizationStatus]
 COLOUR_ENCODING_UNSPECIFIED: ColourEncoding
 COLOUR_ENCODING_JPEG: ColourEncoding
 COLOUR_ENCODING_PNG: ColourEncoding
@@ -29,6 +36,10 @@ DEPTH_ENCODING_UNSPECIFIED: DepthEncoding
 DEPTH_ENCODING_PNG16: DepthEncoding
 DEPTH_ENCODING_RAW16: DepthEncoding
 DEPTH_ENCODING_ZLIB16: DepthEncoding
+LOCALIZATION_STATUS_UNSPECIFIED: LocalizationStatus
+LOCALIZATION_STATUS_LOCALISED: LocalizationStatus
+LOCALIZATION_STATUS_COLOUR_ONLY: LocalizationStatus
+LOCALIZATION_STATUS_NOT_LOCALISED: LocalizationStatus
 
 class ColourImage(_message.Message):
     __slots__ = ("encoding", "bytes")
@@ -116,3 +127,52 @@ class TrackFramesResponse(_message.Message):
     credit: int
     error: _types_pb2.ErrorDetail
     def __init__(self, seq: _Optional[int] = ..., t_ns: _Optional[int] = ..., status: _Optional[_Union[_types_pb2.TrackingStatus, str]] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., pos_std_m: _Optional[float] = ..., rot_std_deg: _Optional[float] = ..., inliers: _Optional[int] = ..., inlier_share: _Optional[float] = ..., reference_seq: _Optional[int] = ..., map_revision: _Optional[int] = ..., keyframe: _Optional[bool] = ..., timings_ms: _Optional[_Mapping[str, float]] = ..., credit: _Optional[int] = ..., error: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ...) -> None: ...
+
+class LocalizeRequest(_message.Message):
+    __slots__ = ("session_id", "rgb", "depth", "T_map_camera_prior", "calibration", "camera")
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    RGB_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
+    T_MAP_CAMERA_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    rgb: ColourImage
+    depth: DepthImage
+    T_map_camera_prior: _types_pb2.Pose
+    calibration: _types_pb2.Calibration
+    camera: _types_pb2.Camera
+    def __init__(self, session_id: _Optional[str] = ..., rgb: _Optional[_Union[ColourImage, _Mapping]] = ..., depth: _Optional[_Union[DepthImage, _Mapping]] = ..., T_map_camera_prior: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., calibration: _Optional[_Union[_types_pb2.Calibration, _Mapping]] = ..., camera: _Optional[_Union[_types_pb2.Camera, _Mapping]] = ...) -> None: ...
+
+class LocalizeResponse(_message.Message):
+    __slots__ = ("status", "reason", "T_map_camera", "pos_std_m", "rot_std_deg", "covariance", "inliers", "inlier_share", "reference_seq", "map_revision", "timings_ms")
+    class TimingsMsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    T_MAP_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    POS_STD_M_FIELD_NUMBER: _ClassVar[int]
+    ROT_STD_DEG_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    INLIERS_FIELD_NUMBER: _ClassVar[int]
+    INLIER_SHARE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_SEQ_FIELD_NUMBER: _ClassVar[int]
+    MAP_REVISION_FIELD_NUMBER: _ClassVar[int]
+    TIMINGS_MS_FIELD_NUMBER: _ClassVar[int]
+    status: LocalizationStatus
+    reason: str
+    T_map_camera: _types_pb2.Pose
+    pos_std_m: float
+    rot_std_deg: float
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    inliers: int
+    inlier_share: float
+    reference_seq: int
+    map_revision: int
+    timings_ms: _containers.ScalarMap[str, float]
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., reason: _Optional[str] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., pos_std_m: _Optional[float] = ..., rot_std_deg: _Optional[float] = ..., covariance: _Optional[_Iterable[float]] = ..., inliers: _Optional[int] = ..., inlier_share: _Optional[float] = ..., reference_seq: _Optional[int] = ..., map_revision: _Optional[int] = ..., timings_ms: _Optional[_Mapping[str, float]] = ...) -> None: ...

@@ -40,6 +40,11 @@ class TrackingServiceStub:
                 request_serializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.SerializeToString,
                 response_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.FromString,
                 _registered_method=True)
+        self.Localize = channel.unary_unary(
+                '/pointslam.v1.TrackingService/Localize',
+                request_serializer=pointslam_dot_v1_dot_tracking__service__pb2.LocalizeRequest.SerializeToString,
+                response_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.LocalizeResponse.FromString,
+                _registered_method=True)
 
 
 class TrackingServiceServicer:
@@ -54,6 +59,13 @@ class TrackingServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Localize(self, request, context):
+        """Where in a session's map was this image taken? Open or on disk; nothing of it changes.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_TrackingServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -61,6 +73,11 @@ def add_TrackingServiceServicer_to_server(servicer, server):
                     servicer.TrackFrames,
                     request_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.FromString,
                     response_serializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.SerializeToString,
+            ),
+            'Localize': grpc.unary_unary_rpc_method_handler(
+                    servicer.Localize,
+                    request_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.LocalizeRequest.FromString,
+                    response_serializer=pointslam_dot_v1_dot_tracking__service__pb2.LocalizeResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -91,6 +108,33 @@ class TrackingService:
             '/pointslam.v1.TrackingService/TrackFrames',
             pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.SerializeToString,
             pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Localize(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/pointslam.v1.TrackingService/Localize',
+            pointslam_dot_v1_dot_tracking__service__pb2.LocalizeRequest.SerializeToString,
+            pointslam_dot_v1_dot_tracking__service__pb2.LocalizeResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -19,6 +19,7 @@ from shared.errors import (
 )
 from shared.frames import ColourEncoding, DepthEncoding, TrackingStatus
 from shared.images import decode_depth
+from shared.localization import LocalizationStatus
 from shared.se3 import exp
 from shared.stream import ErrorDetail
 
@@ -195,6 +196,21 @@ def test_the_asynchronous_client_does_the_same(gateway):
     assert [t for t, _ in poses] == [(i + 1) * SECOND for i in range(11)]
     assert view.rgb.shape == (48, 64, 3)
     assert size == 3000
+
+
+async def localize_async(url, name):
+    async with AsyncClient(url) as client:
+        session = await client.session(name)
+        return await session.localize(RGB, DEPTH, T_map_camera_prior=np.eye(4))
+
+
+def test_both_clients_find_an_image_alike(gateway, session):
+    a = session.localize(RGB, DEPTH, T_map_camera_prior=np.eye(4))
+
+    b = asyncio.run(localize_async(gateway.url, session.name))
+
+    assert a.status is LocalizationStatus.LOCALISED
+    assert (a.status, a.T_map_camera, a.covariance) == (b.status, b.T_map_camera, b.covariance)
 
 
 async def stream_to_nobody(url):

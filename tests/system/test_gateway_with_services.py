@@ -17,6 +17,7 @@ from pointslam.synth import Noise, SynthOptions, record_scene
 from shared.camera import Intrinsics
 from shared.errors import InputError
 from shared.frames import DepthImage, TrackingStatus
+from shared.localization import LocalizationStatus
 from shared.wire import pose_service_pb2, pose_service_pb2_grpc
 
 pytestmark = pytest.mark.system
@@ -152,6 +153,22 @@ def test_a_mapper_killed_in_the_middle_keeps_every_answered_frame(services, sess
     assert len(session.trajectory()) == 20
     assert session.info()["keyframes"] >= keyframes
     assert session.info()["epoch"] == 2
+
+
+def test_an_image_is_found_in_a_map_taken_up_from_disk(services, session, room):
+    stream(session, room, 0, 15)
+    kill_and_restart(services, "mapper-0")
+    image = room.frame(17)
+
+    found = session.localize(image.rgb, image.depth)
+    by_colour = session.localize(image.rgb)
+
+    T_true = room.truth(17)
+    assert found.status is LocalizationStatus.LOCALISED
+    assert np.linalg.norm(found.T_map_camera.matrix()[:3, 3] - T_true[:3, 3]) < 0.01
+    assert by_colour.status is LocalizationStatus.COLOUR_ONLY
+    assert np.linalg.norm(by_colour.T_map_camera.matrix()[:3, 3] - T_true[:3, 3]) < 0.02
+    assert len(session.trajectory()) == 15
 
 
 def test_a_gateway_killed_in_the_middle_takes_the_session_up_again(services, client, session, room):

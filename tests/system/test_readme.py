@@ -13,6 +13,7 @@ from pointslam.synth import Noise, SynthOptions
 from pointslam.synth.path import camera_path
 from pointslam.synth.record import render_frame
 from shared.frames import HAS_POSE
+from shared.localization import LocalizationStatus
 
 pytestmark = pytest.mark.system
 
@@ -23,7 +24,7 @@ ROOM = SynthOptions(num_frames=3, noise=Noise.NONE)
 def example(number: int, printed: str, actual: str) -> str:
     """One of the README's Python blocks with another address."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) == 2 and printed in blocks[number]
+    assert len(blocks) == 3 and printed in blocks[number]
     return blocks[number].replace(printed, actual)
 
 
@@ -62,3 +63,12 @@ def test_the_robots_example_gets_the_headsets_pose(headset, services):
 
     told = headset["reply"].T_map_camera.position
     assert names["pose"].T_map_camera.position.x == pytest.approx(told.x, abs=1e-9)
+
+
+def test_the_example_of_one_image_finds_it(headset, services, camera):
+    names = {"rgb": camera[1][0], "depth": camera[1][1]}
+
+    exec(example(2, "http://127.0.0.1:8080", services.url), names)
+
+    assert names["found"].status is LocalizationStatus.LOCALISED
+    assert names["found"].pos_std_m < 0.02

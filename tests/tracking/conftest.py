@@ -131,3 +131,15 @@ def room() -> Room:
 @pytest.fixture
 def session() -> Session:
     return Session()
+
+
+@pytest.fixture(scope="session")
+def new_session() -> type[Session]:
+    """What makes a session of its own."""
+    return Session
+
+
+@pytest.fixture(scope="session")
+def source_of() -> type[StoreSource]:
+    """What makes a source of a keyframe store."""
+    return StoreSource
