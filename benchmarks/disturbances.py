@@ -21,7 +21,7 @@ from shared.se3 import inverse
 
 
 class Sequence(Protocol):
-    """Frames with their true poses, as `benchmarks.tracking.Folder` has them."""
+    """Frames with their true poses, as `benchmarks.tracking_run.Folder` has them."""
 
     calibration: Calibration
 

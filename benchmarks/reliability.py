@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from benchmarks.disturbances import Plan, Sent, Sequence, disturbed
-from benchmarks.tracking import Folder, StoreSource
+from benchmarks.tracking_run import Folder, StoreSource
 from services.gateway.prior import next_prior
 from services.mapping.keyframes import KeyframeStore
 from services.tracking.config import TrackingConfig

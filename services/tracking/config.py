@@ -184,7 +184,7 @@ class KeyframeRuleConfig:
 class BundleAdjustmentConfig:
     """Local bundle adjustment of a new keyframe's window."""
 
-    iterations: int = 8
+    iterations: int = 8  # 0: keyframes stay where they were tracked
     pixel_sigma: float = 1.5
     huber_sigma: float = 2.0
     outlier_chi2: float = 16.0
@@ -193,7 +193,9 @@ class BundleAdjustmentConfig:
     pose_prior_share: float = 1.0  # weight of the geometry that holds a window's poses
 
     def __post_init__(self) -> None:
-        _require_positive(self, "pixel_sigma", "huber_sigma", "iterations")
+        _require_positive(self, "pixel_sigma", "huber_sigma")
+        if self.iterations < 0:
+            raise ConfigError(f"iterations must not be negative, got {self.iterations}")
 
 
 @dataclass(frozen=True)

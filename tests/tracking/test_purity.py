@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks.tracking import StoreSource as CachingSource
+from benchmarks.tracking_run import StoreSource as CachingSource
 from services.tracking.config import TrackingConfig
 from services.tracking.pipeline import track
 from shared import codec

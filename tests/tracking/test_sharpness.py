@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.tracking import Folder
+from benchmarks.tracking_run import Folder
 from services.tracking.config import KeyframeRuleConfig
 from services.tracking.keyframes import Coverage, Sharpness, is_too_blurred, sharpness_of
 from services.tracking.sharpness import edge_blur_px

@@ -1,0 +1,235 @@
+"""Tracking alone, in process, over a sequence folder: errors against truth, times by stage."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cold_worker import ColdWorker, cold_worker
+from services.mapping.keyframes import KeyframeConfig, KeyframeStore
+from services.tracking.config import TrackingConfig
+from services.tracking.local_map import LocalMap, derive
+from services.tracking.pipeline import track
+from shared.camera import Calibration, Camera, Intrinsics
+from shared.frames import (
+    HAS_POSE,
+    ColourEncoding,
+    ColourImage,
+    DepthEncoding,
+    DepthImage,
+    Frame,
+    Prior,
+    TrackingStatus,
+    TrackRequest,
+)
+from shared.se3 import angle_rad, from_quat_xyzw, inverse
+from shared.tracks import Candidates, CandidatesRequest, TrackResult
+
+Poses = NDArray[np.float64]  # [F, 4, 4]
+
+
+class Folder:
+    """A sequence folder with calibration.json, associations.txt and groundtruth.txt."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        values = json.loads((path / "calibration.json").read_text())
+        names = ("fx", "fy", "cx", "cy", "width", "height")
+        camera = Camera(Intrinsics(*(values[name] for name in names)))
+        self.calibration = Calibration(camera, values["depth_scale"])
+        self._rows = [line.split() for line in _lines(path / "associations.txt")]
+        self._truth = np.loadtxt(path / "groundtruth.txt", ndmin=2)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def frame(self, index: int) -> Frame:
+        """One frame; every eighth is held out of the map, as an evaluation run does."""
+        stamp, colour, _, depth = self._rows[index]
+        return Frame(
+            seq=index,
+            t_ns=round(float(stamp) * 1e9),
+            rgb=ColourImage(ColourEncoding.JPEG, (self._path / colour).read_bytes()),
+            depth=DepthImage(DepthEncoding.PNG16, (self._path / depth).read_bytes()),
+            may_be_keyframe=index % 8 != 4,
+        )
+
+    def true_pose(self, index: int) -> NDArray[np.float64]:
+        """T_world_camera of the nearest stamp."""
+        stamps = self._truth[:, 0]
+        row = self._truth[np.argmin(np.abs(stamps - float(self._rows[index][0])))]
+        return from_quat_xyzw(row[4:8], row[1:4])
+
+
+def _lines(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+
+
+class StoreSource:
+    """A map in this process as tracking asks for it."""
+
+    def __init__(self, store: KeyframeStore, config: TrackingConfig) -> None:
+        self._store = store
+        self._config = config
+        self._key = (-1, -1)
+        self._local: LocalMap | None = None
+
+    def local_map(self, reference_seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe; the last one is kept."""
+        key = (self._store.revision, reference_seq)
+        if self._local is None or key != self._key:
+            context = self._store.context(reference_seq)
+            self._key, self._local = key, derive(context, self._config.registration)
+        return self._local
+
+    def loop_map(self, seq: int) -> LocalMap:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+        return derive(self._store.loop_context(seq), self._config.registration)
+
+    def candidates(self, request: CandidatesRequest) -> Candidates:
+        """Keyframes that look like a frame."""
+        return self._store.candidates(request)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one sequence."""
+
+    sequence: str
+    frames: int
+    lost: int
+    coarse_only: int
+    relocalised: int
+    keyframes: int
+    ate_online_cm: float
+    ate_final_cm: float
+    rpe1_mm: float
+    rpe1_deg: float
+    rpe30_mm: float
+    rpe30_deg: float
+    total_ms_median: float
+    total_ms_p95: float
+    stages_ms_median: dict[str, float] = field(default_factory=dict)
+    stages_ms_p95: dict[str, float] = field(default_factory=dict)
+    cold_worker: ColdWorker | None = None
+
+
+def run(
+    folder: Folder,
+    name: str,
+    indices: list[int],
+    config: TrackingConfig,
+    keyframes: KeyframeConfig | None = None,
+) -> Row:
+    """Track the frames in order, as the gateway and the map's owner would let it happen."""
+    store = KeyframeStore(keyframes)
+    source = StoreSource(store, config)
+    prior: Prior | None = None
+    results: list[TrackResult] = []
+    with ThreadPoolExecutor(1) as helper:  # as a worker has
+        for index in indices:
+            request = _request(folder, index, prior, store.revision)
+            result = track(request, source, config, helper)
+            if result.keyframe is not None:
+                store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
+            prior = next_prior(prior, result, store)
+            results.append(result)
+    truth = np.stack([folder.true_pose(index) for index in indices])
+    return _row(name, results, truth, store, config)
+
+
+def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> TrackRequest:
+    return TrackRequest(
+        session="benchmark",
+        epoch=1,
+        map_revision=revision,
+        calibration=folder.calibration,
+        frame=folder.frame(index),
+        prior=prior,
+        T_world_first=np.eye(4),
+    )
+
+
+def next_prior(prior: Prior | None, result: TrackResult, store: KeyframeStore) -> Prior | None:
+    """What the gateway remembers after a frame."""
+    if result.status not in HAS_POSE:
+        if prior is None:
+            return None
+        return Prior(**{**prior.__dict__, "lost_frames": prior.lost_frames + 1})
+    T = store.pose(result.reference_seq) @ result.T_reference_camera
+    is_keyframe = result.keyframe is not None
+    return Prior(
+        seq=result.seq,
+        t_ns=result.t_ns,
+        T_world_camera=T,
+        T_before_last=np.eye(4) if result.T_last_camera is None else result.T_last_camera,
+        before_last_dt_ns=result.t_ns - prior.t_ns if prior else 0,
+        reference_seq=result.reference_seq,
+        newest_keyframe_seq=store.seqs()[-1],
+        lost_frames=0,
+        frames_since_keyframe=0 if is_keyframe or not prior else prior.frames_since_keyframe + 1,
+    )
+
+
+def _row(
+    name: str,
+    results: list[TrackResult],
+    truth: Poses,
+    store: KeyframeStore,
+    config: TrackingConfig,
+) -> Row:
+    has_pose = np.array([result.status in HAS_POSE for result in results])
+    found = [result for result in results if result.status in HAS_POSE]
+    online = np.stack([result.T_world_camera for result in found])
+    final = np.stack([store.pose(r.reference_seq) @ r.T_reference_camera for r in found])
+    truth = truth[has_pose]
+    rpe1, rpe30 = relative_errors(final, truth, 1), relative_errors(final, truth, 30)
+    totals = [result.timings_ms["total"] for result in results]
+    names = sorted({stage for result in results for stage in result.timings_ms})
+    stages = {n: [r.timings_ms[n] for r in results if n in r.timings_ms] for n in names}
+    counted = [result.status for result in results]
+    return Row(
+        sequence=name,
+        frames=len(results),
+        lost=int((~has_pose).sum()),
+        coarse_only=counted.count(TrackingStatus.COARSE_ONLY),
+        relocalised=counted.count(TrackingStatus.RELOCALISED),
+        keyframes=len(store),
+        ate_online_cm=100 * absolute_error(online, truth),
+        ate_final_cm=100 * absolute_error(final, truth),
+        rpe1_mm=1e3 * rpe1[0],
+        rpe1_deg=rpe1[1],
+        rpe30_mm=1e3 * rpe30[0],
+        rpe30_deg=rpe30[1],
+        total_ms_median=float(np.median(totals)),
+        total_ms_p95=float(np.percentile(totals, 95)),
+        stages_ms_median={name: float(np.median(times)) for name, times in stages.items()},
+        stages_ms_p95={name: float(np.percentile(times, 95)) for name, times in stages.items()},
+        cold_worker=cold_worker(store, config),
+    )
+
+
+def absolute_error(poses: Poses, truth: Poses) -> float:
+    """ATE: root mean square distance after rigid alignment without scale (Umeyama), metres."""
+    a, b = poses[:, :3, 3], truth[:, :3, 3]
+    u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    aligned = (a - a.mean(0)) @ rotation.T + b.mean(0)
+    return float(np.sqrt(np.square(aligned - b).sum(axis=1).mean()))
+
+
+def relative_errors(poses: Poses, truth: Poses, gap: int) -> tuple[float, float]:
+    """RPE over a gap of frames: root mean squares in metres and degrees; NaN if too short."""
+    if len(poses) <= gap:
+        return float("nan"), float("nan")
+    steps = inverse(poses[:-gap]) @ poses[gap:]
+    true_steps = inverse(truth[:-gap]) @ truth[gap:]
+    errors = inverse(true_steps) @ steps
+    angles = [np.degrees(angle_rad(error)) for error in errors]
+    distances = np.square(errors[:, :3, 3]).sum(axis=1)
+    return float(np.sqrt(distances.mean())), float(np.sqrt(np.square(angles).mean()))
