@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import RegistrationConfig
-from services.tracking.twists import exp_twist
+from services.tracking.normal_equations import NormalEquations, known_directions
+from services.tracking.twists import exp_twist, inverse_rigid, log_twist
 from services.tracking.voxel_map import VoxelLevel, VoxelMap, cell_key, find_slot, main_axis
 from shared.se3 import orthonormalise
 from shared.tracks import PointCloud
@@ -49,7 +50,26 @@ def align(
     T = T_world_camera
     for index, level in enumerate(target.levels):
         T = _align_level(_every(source, config.sample_steps[index]), level, T, index, config)
-    return linearise(source, target.levels[-1], orthonormalise(T), config)
+    return _without_slide(source, target.levels[-1], orthonormalise(T), T_world_camera, config)
+
+
+def _without_slide(
+    source: PointCloud,
+    level: VoxelLevel,
+    T: NDArray[np.float64],
+    T_start: NDArray[np.float64],
+    config: RegistrationConfig,
+) -> Registration:
+    """At a registered pose, but back at the start along what the geometry leaves open.
+
+    Only here: on the way the normals differ because the pose is off, not because of noise.
+    """
+    equations = _finest_equations(source, level, T, config)
+    back = log_twist(inverse_rigid(T) @ T_start)
+    slide = back - equations.projector(config.min_eigenvalue_share) @ back
+    if np.linalg.norm(slide) < config.tolerances[-1]:
+        return _registration(T, equations, config)
+    return linearise(source, level, T @ exp_twist(slide), config)
 
 
 def _every(cloud: PointCloud, step: int) -> PointCloud:
@@ -66,8 +86,8 @@ def _align_level(
     """Iterate on one level until it has no more to say than the next one will."""
     tolerance = config.tolerances[index]
     for _ in range(config.max_iterations[index]):
-        H, b, _, _ = _normal_equations(source, level, T, config)
-        twist = _well_determined_step(H, b, config.min_eigenvalue_share)
+        equations = _normal_equations(source, level, T, config)
+        twist = equations.step(config.min_eigenvalue_share)
         T = T @ exp_twist(twist)
         if np.linalg.norm(twist[:3]) < tolerance and np.linalg.norm(twist[3:]) < tolerance:
             break
@@ -78,26 +98,43 @@ def linearise(
     source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
 ) -> Registration:
     """The registration's cost around a pose, without a step."""
-    step = config.sample_steps[-1]
-    H, b, overlap, scale = _normal_equations(_every(source, step), level, T, config)
-    sigma = max(scale, config.model_sigma)
-    factor = step * config.effective_share / sigma**2
-    return Registration(T, factor * H, factor * b, overlap, scale)
+    return _registration(T, _finest_equations(source, level, T, config), config)
+
+
+def _finest_equations(
+    source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
+) -> NormalEquations:
+    return _normal_equations(_every(source, config.sample_steps[-1]), level, T, config)
+
+
+def _registration(
+    T: NDArray[np.float64], equations: NormalEquations, config: RegistrationConfig
+) -> Registration:
+    """In units of what is independent, of the directions that the geometry holds."""
+    known = equations.projector(config.min_eigenvalue_share)
+    sigma = max(equations.residual_scale, config.model_sigma)
+    factor = config.sample_steps[-1] * config.effective_share / sigma**2
+    return Registration(
+        T,
+        factor * known.T @ equations.H @ known,
+        factor * known.T @ equations.b,
+        equations.overlap,
+        equations.residual_scale,
+    )
 
 
 def optimum(registration: Registration, config: RegistrationConfig) -> NDArray[np.float64]:
     """The pose where a linearised registration has its minimum, T_world_camera."""
-    step = _well_determined_step(
-        registration.information, registration.gradient, config.min_eigenvalue_share
-    )
-    return registration.T_world_camera @ exp_twist(step)
+    H, share = registration.information, config.min_eigenvalue_share
+    basis = known_directions(H, H, share)
+    return registration.T_world_camera @ exp_twist(-basis @ (basis.T @ registration.gradient))
 
 
 def _normal_equations(
     source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Hessian, gradient (in depth sigmas), overlap and residual scale at a pose."""
-    residuals, rows = _correspond(
+) -> NormalEquations:
+    """The system of the robust cost at a pose; empty where hardly anything corresponds."""
+    residuals, rows, own_rows = _correspond(
         source.points,
         source.normals,
         T,
@@ -109,32 +146,24 @@ def _normal_equations(
         np.array([config.min_normal_cos, config.depth_sigma_floor_m, config.depth_sigma_per_m2]),
     )
     if len(residuals) < 30:
-        return np.zeros((6, 6)), np.zeros(6), 0.0, 1.0
+        return NormalEquations(np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), 0.0, 1.0)
     scale = 1.4826 * float(np.median(np.abs(residuals)))
     width = max(config.kernel_width * scale, config.min_kernel_width)
-    H, b = _accumulate(rows, residuals, width)
-    return H, b, len(residuals) / len(source.points), scale
-
-
-def _well_determined_step(
-    H: NDArray[np.float64], b: NDArray[np.float64], min_share: float
-) -> NDArray[np.float64]:
-    """Gauss-Newton step without the directions that the geometry leaves open (Zhang, ICRA 2016)."""
-    values, vectors = np.linalg.eigh(H)
-    keep = values > min_share * max(values[-1], 1e-12)
-    if not keep.any():
-        return np.zeros(6)
-    basis = vectors[:, keep]
-    return -basis @ ((basis.T @ b) / values[keep])
+    H, signal, b = _accumulate(rows, own_rows, residuals, width)
+    return NormalEquations(H, signal, b, len(residuals) / len(source.points), scale)
 
 
 @numba.njit(cache=True, nogil=True)
 def _correspond(  # noqa: PLR0913 - compiled
     points, normals, T, size, keys, rows, map_points, map_normals, limits
 ):  # pragma: no cover - compiled
-    """Residuals along the map's normal [M] and their rows of the Jacobian [M, 6], depth sigmas."""
+    """Residuals along the map's normals [M] and their Jacobian [M, 6], in depth sigmas.
+
+    Third, the Jacobian [M, 6] that the points' own normals would give.
+    """
     residuals = np.empty(len(points))
     rows_J = np.empty((len(points), 6))
+    rows_own = np.empty((len(points), 6))
     count = 0
     for n in range(len(points)):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
@@ -161,13 +190,19 @@ def _correspond(  # noqa: PLR0913 - compiled
         gx = weight * (T[0, 0] * wx + T[1, 0] * wy + T[2, 0] * wz)
         gy = weight * (T[0, 1] * wx + T[1, 1] * wy + T[2, 1] * wz)
         gz = weight * (T[0, 2] * wx + T[1, 2] * wy + T[2, 2] * wz)
-        J = rows_J[count]
-        J[0], J[1], J[2] = gx, gy, gz
-        J[3] = py * gz - pz * gy
-        J[4] = pz * gx - px * gz
-        J[5] = px * gy - py * gx
+        _jacobian(px, py, pz, gx, gy, gz, rows_J[count])
+        _jacobian(px, py, pz, weight * mx, weight * my, weight * mz, rows_own[count])
         count += 1
-    return residuals[:count], rows_J[:count]
+    return residuals[:count], rows_J[:count], rows_own[:count]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _jacobian(px, py, pz, gx, gy, gz, out):  # noqa: PLR0913 - compiled
+    """Derivative by a camera twist of g . p, the world at rest."""
+    out[0], out[1], out[2] = gx, gy, gz
+    out[3] = py * gz - pz * gy
+    out[4] = pz * gx - px * gz
+    out[5] = px * gy - py * gx
 
 
 @numba.njit(cache=True, nogil=True)
@@ -238,18 +273,21 @@ def _second_axis(x, y, z, first):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(rows, residuals, width):  # pragma: no cover - compiled
-    """Normal equations with the Geman-McClure weight."""
+def _accumulate(rows, own_rows, residuals, width):  # pragma: no cover - compiled
+    """Normal equations with the Geman-McClure weight; between them the signal in H."""
     H = np.zeros((6, 6))
+    signal = np.zeros((6, 6))
     b = np.zeros(6)
     for n in range(len(residuals)):
         weight = 1.0 / (1.0 + (residuals[n] / width) ** 2) ** 2
         for i in range(6):
-            scaled = weight * rows[n, i]
+            scaled, own = weight * rows[n, i], weight * own_rows[n, i]
             b[i] += scaled * residuals[n]
             for j in range(i, 6):
                 H[i, j] += scaled * rows[n, j]
+                signal[i, j] += 0.5 * (scaled * own_rows[n, j] + own * rows[n, j])
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
-    return H, b
+            signal[i, j] = signal[j, i]
+    return H, signal, b

@@ -73,6 +73,28 @@ def test_the_information_of_a_wall_is_nothing_along_it():
     assert along.max() < 1e-6 * across
 
 
+def noisy_edge(seed: int) -> PointCloud:
+    """Two walls that meet in an edge along y; their normals are some degrees off."""
+    rng = np.random.default_rng(seed)
+    along, off = rng.uniform(-1.0, 1.0, (2, 20000)), rng.normal(0.0, 0.05, (40000, 3))
+    s = np.abs(along[1])
+    left, right = np.stack([-s, along[0], 2.0 - s]), np.stack([s, along[0], 2.0 - s])
+    normals = np.repeat([[1.0, 0.0, -1.0], [-1.0, 0.0, -1.0]], 20000, axis=0) + off
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.concatenate([left.T, right.T])
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32))
+
+
+def test_noise_in_the_normals_is_not_taken_for_information_along_an_edge():
+    target = build_voxel_map(noisy_edge(0), CONFIG.voxel_sizes_m)
+    start = exp([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])
+
+    registration = align(noisy_edge(1), target, start, CONFIG)
+
+    np.testing.assert_allclose(registration.T_world_camera[:3, 3], [0.0, 0.05, 0.0], atol=1e-3)
+    assert registration.information[1, 1] < 1e-4 * registration.information[0, 0]
+
+
 def test_the_gradient_points_back_to_the_optimum(room):
     target = build_voxel_map(cloud_of(room, CORNER), CONFIG.voxel_sizes_m)
     away = exp([0.002, -0.001, 0.001, 0.001, 0.0005, -0.001])
