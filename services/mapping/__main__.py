@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
@@ -11,7 +10,7 @@ import torch
 from services.mapping.config import MappingConfig
 from services.mapping.host import MapperHost, MapperSettings
 from services.mapping.metrics import SessionCollector
-from services.mapping.priority import give_way
+from services.mapping.priority import others_give_way
 from services.mapping.warm_up import warm_up
 from shared.bus import open_bus
 from shared.errors import ConfigError
@@ -40,12 +39,6 @@ def device_named(name: str) -> torch.device:
     return torch.device("cuda" if has_cuda and name != "cpu" else "cpu")
 
 
-def warm_up_with_priority(niceness: int) -> None:
-    """Warm up on a thread that gives way: the pools it starts are those that optimise."""
-    with ThreadPoolExecutor(1, initializer=give_way, initargs=(niceness,)) as thread:
-        thread.submit(warm_up).result()
-
-
 def main(argv: list[str]) -> None:
     """Read settings, warm up, connect, serve until told to stop."""
     parser = service_arguments(__doc__)
@@ -63,7 +56,8 @@ def main(argv: list[str]) -> None:
         device=device_named(arguments.device),
     )
     serve_metrics(arguments)
-    warm_up_with_priority(settings.config.owner.niceness)
+    warm_up()
+    others_give_way(settings.config.owner.niceness)
     with open_bus(endpoints(arguments)) as bus:
         host = MapperHost(bus, settings)
         SessionCollector(host.infos)

@@ -177,7 +177,7 @@ class OwnerConfig:
     lease_s: float = 5.0  # a frozen owner's sessions are free to others after so long
     lease_store: str = ""  # SQLite beside the sessions, or postgresql://user@host/name
     max_sessions: int = 16  # open at a time; others go to another mapper
-    niceness: int = 10  # of the threads that optimise, below those that answer
+    niceness: int = 5  # steps that the threads that optimise stay below those that answer
 
     def __post_init__(self) -> None:
         _check(0 <= self.niceness <= 19, "owner.niceness must be 0 to 19")

@@ -12,11 +12,21 @@ import threading
 _LOWEST = 19
 
 
-def give_way(niceness: int) -> None:
-    """Lower the priority of this thread, and of all that it starts, by so many steps.
+def give_way(niceness: int, thread: int | None = None) -> None:
+    """Lower the priority of a thread (of this one: None), and of all that it starts, by some steps.
 
     A step is worth about 20 % of the processor where two threads want the same core (man 7 sched).
     """
-    thread = threading.get_native_id()
+    thread = thread or threading.get_native_id()
     now = os.getpriority(os.PRIO_PROCESS, thread)
     os.setpriority(os.PRIO_PROCESS, thread, min(now + niceness, _LOWEST))
+
+
+def others_give_way(niceness: int) -> None:
+    """Lower all threads of this process but the present one; after the warm-up those are the pools.
+
+    The warm-up itself does not give way: whoever starts a service waits for it.
+    """
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and thread.native_id is not None:
+            give_way(niceness, thread.native_id)

@@ -2,7 +2,7 @@ import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-from services.mapping.priority import give_way
+from services.mapping.priority import give_way, others_give_way
 
 
 def niceness() -> int:
@@ -28,3 +28,13 @@ def test_threads_started_by_one_that_gives_way_do_so_too():
         inherited = thread.submit(start_another).result()
 
     assert inherited == min(niceness() + 5, 19)
+
+
+def test_the_threads_of_a_pool_give_way_to_the_one_that_asks_them_to():
+    with ThreadPoolExecutor(1) as pool:
+        before = pool.submit(niceness).result()
+
+        others_give_way(5)
+
+        assert pool.submit(niceness).result() == min(before + 5, 19)
+    assert niceness() == before
