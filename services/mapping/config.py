@@ -67,14 +67,14 @@ class DecoderConfig:
 class LearningRates:
     """Steps of Adam, per parameter."""
 
-    features: float = 0.04
+    features: float = 1e-2
     offsets: float = 0.02
-    scalings: float = 0.02
+    scalings: float = 7e-3
     colours: float = 0.05  # of plain Gaussians, as the next three
     opacities: float = 0.05
     sizes: float = 0.02
     turns: float = 0.01
-    opacity_network: float = 8e-3
+    opacity_network: float = 2e-3
     colour_network: float = 8e-3
     covariance_network: float = 4e-3
     exposure_gain: float = 5e-3
