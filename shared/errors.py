@@ -61,6 +61,10 @@ class GoneError(UnavailableError):
     """Nobody answered: the process that did is gone. Another may be asked at once."""
 
 
+class SteppedDownError(GoneError):
+    """This process answers no longer for what it was asked, and must be as silent as if gone."""
+
+
 class TimedOutError(UnavailableError):
     """The process is there but frozen or too slow."""
 

@@ -13,10 +13,10 @@ from shared import codec
 from shared.errors import (
     ConfigError,
     ConflictError,
-    GoneError,
     InputError,
     NotFoundError,
     PointSlamError,
+    SteppedDownError,
     StorageError,
     TimedOutError,
     UnavailableError,
@@ -60,8 +60,8 @@ def answer_query(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any
         try:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             query.reply(key, codec.pack(answer(codec.unpack(kind, payload))))
-        except GoneError as error:
-            # No reply at all is how a process that is gone answers: the sender looks for another.
+        except SteppedDownError as error:
+            # No reply at all: the sender then looks for whoever answers now.
             LOGGER.warning("%s: not answered: %s", key, error)
         except InputError as error:
             query.reply_err(codec.pack(_Failure(error.code, error.reason, error.field)))

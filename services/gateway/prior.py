@@ -20,7 +20,8 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
             lost_frames=prior.lost_frames + 1,
             frames_since_keyframe=prior.frames_since_keyframe + 1,
         )
-    if prior is not None and prior.frame_digest == frame.digest():
+    is_repeat = prior is not None and prior.frame_digest == frame.digest()
+    if prior is not None and is_repeat and not is_keyframe:
         return _after_repeat(prior, result)
     dt_ns = 0 if prior is None else result.t_ns - prior.t_ns
     newest = prior.newest_keyframe_seq if prior else result.reference_seq
@@ -44,7 +45,7 @@ def next_prior(prior: Prior | None, frame: Frame, result: TrackResult) -> Prior 
 def _after_repeat(prior: Prior, result: TrackResult) -> Prior:
     """The prior after the same image again: it tells nothing of how the camera moved since.
 
-    Time, odometry and motion stay those of the image when it was new; a repeat is no keyframe.
+    Time, odometry and motion stay those of the image when it was new.
     """
     return dataclasses.replace(
         prior,

@@ -125,7 +125,7 @@ class Session:
 
         Raises:
             InputError, ConflictError, StorageError: as `Ledger.append`.
-            GoneError: another mapper may own the session by now; nothing is acknowledged.
+            SteppedDownError: another mapper may own the session by now; nothing is acknowledged.
         """
         with self._calm:
             self._lease.check()
@@ -195,7 +195,7 @@ class Session:
 
         Raises:
             StorageError: the disk refused.
-            GoneError: another mapper may own the session by now.
+            SteppedDownError: another mapper may own the session by now.
         """
         with self._saving:
             with self._calm:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from services.mapping.leases import LeaseStore
-from shared.errors import GoneError, StorageError
+from shared.errors import SteppedDownError, StorageError
 
 LOGGER = logging.getLogger(__name__)
 _SURE_SHARE = 0.75  # of the lease, in which its owner may act
@@ -37,10 +37,10 @@ class Lease:
         """Refuse to act for a session that another mapper may own by now.
 
         Raises:
-            GoneError: the lease ran out or was taken; whoever asked finds the owner anew.
+            SteppedDownError: the lease ran out or was taken; whoever asked finds the owner anew.
         """
         if not self.is_valid():
-            raise GoneError(f"session {self.session}: epoch {self.epoch} is over")
+            raise SteppedDownError(f"session {self.session}: epoch {self.epoch} is over")
 
 
 @dataclass
