@@ -123,11 +123,17 @@ def _fitted(copy: MapCopy, block: Tensor, colours: Tensor, degree: int) -> Tenso
         camera = View(se3.inverse(view.T_world_camera), copy.sightings.camera)
         inside = visible_index(position, camera, len(block))
         inside = inside[sights[inside] < _MAX_SIGHTS]
+        if len(inside) == 0:
+            continue
         agreement = copy.sightings.agreement(position[inside].cpu().numpy(), view)
         weights = torch.from_numpy(agreement).to(position).clamp_min(_MIN_WEIGHT)
         seen = copy.painter.gaussians(block[inside], centres[view.seq])[1].colours
-        colours = seen.view(len(inside), -1)
-        fit.add(inside, position[inside] - centres[view.seq], colours - 0.5, weights)
+        fit.add(
+            inside,
+            position[inside] - centres[view.seq],
+            seen.view_as(colours[inside]) - 0.5,
+            weights,
+        )
         sights[inside] += (weights > 0.5).long()
     return fit.solve()
 

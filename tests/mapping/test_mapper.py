@@ -322,6 +322,17 @@ def test_baked_harmonics_come_nearer_to_the_map_than_a_single_colour(
     assert error(3) < 0.8 * error(0)
 
 
+def test_a_keyframe_that_sees_none_of_the_map_does_not_hinder_baking(mapper, insert):
+    insert(mapper, 0)
+    copy = MapCopy.of(mapper)
+    (view,) = copy.views
+    away = replace(view, T_world_camera=se3.exp([0, 0, 0, 0, np.pi, 0]))
+
+    baked = bake(replace(copy, views=[view, away]), ExportConfig())
+
+    assert torch.equal(baked.harmonics, bake(copy, ExportConfig()).harmonics)
+
+
 def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose):
     blind = frame(0).depth
     keyframe = replace(frame(0), depth=replace(blind, bytes=bytes(len(blind.bytes))))
