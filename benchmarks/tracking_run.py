@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cold_worker import ColdWorker, cold_worker
+from services.gateway.prior import next_prior
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.local_map import LocalMap, derive
@@ -137,7 +138,7 @@ def run(
             result = track(request, source, config, helper)
             if result.keyframe is not None:
                 store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
-            prior = next_prior(prior, result, store)
+            prior = next_prior(prior, request.frame, result)
             results.append(result)
     truth = np.stack([folder.true_pose(index) for index in indices])
     return _row(name, results, truth, store, config)
@@ -152,27 +153,6 @@ def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> 
         frame=folder.frame(index),
         prior=prior,
         T_world_first=np.eye(4),
-    )
-
-
-def next_prior(prior: Prior | None, result: TrackResult, store: KeyframeStore) -> Prior | None:
-    """What the gateway remembers after a frame."""
-    if result.status not in HAS_POSE:
-        if prior is None:
-            return None
-        return Prior(**{**prior.__dict__, "lost_frames": prior.lost_frames + 1})
-    T = store.pose(result.reference_seq) @ result.T_reference_camera
-    is_keyframe = result.keyframe is not None
-    return Prior(
-        seq=result.seq,
-        t_ns=result.t_ns,
-        T_world_camera=T,
-        T_before_last=np.eye(4) if result.T_last_camera is None else result.T_last_camera,
-        before_last_dt_ns=result.t_ns - prior.t_ns if prior else 0,
-        reference_seq=result.reference_seq,
-        newest_keyframe_seq=store.seqs()[-1],
-        lost_frames=0,
-        frames_since_keyframe=0 if is_keyframe or not prior else prior.frames_since_keyframe + 1,
     )
 
 
