@@ -45,12 +45,15 @@ class DispatchConfig:
     offline_timeout_s: float = 30.0
     live_wait_s: float = 3.0  # how long a frame waits for a worker to appear
     offline_wait_s: float = 60.0
-    quarantine_s: float = 5.0  # a worker that timed out gets no frames for so long
+    patience_s: float = 0.25  # beside a worker that keeps silent for so long, another is asked,
+    patience_ratio: float = 3.0  # and not before so many times what a frame takes at present
+    quarantine_s: float = 5.0  # a worker that kept silent gets no frames for so long
     load_cap: float = 1.25  # sessions of one worker over the mean of all
     idle_s: float = 10.0  # a session without frames for so long loads no worker
 
     def __post_init__(self) -> None:
         _check_positive(self, "first_frame_timeout_s", "live_timeout_s", "offline_timeout_s")
+        _check_positive(self, "patience_s", "patience_ratio", "quarantine_s")
         if self.load_cap < 1.0:
             raise ConfigError(f"load_cap must be at least 1, got {self.load_cap}")
 

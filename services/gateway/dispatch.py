@@ -1,23 +1,26 @@
 """The pool of tracking workers: which one gets a session's frame, and what if it fails.
 
 Sessions stick to a worker by rendezvous hashing, so that its caches stay warm, and a cap on the
-load spreads them. A worker that is gone is left at once, one that times out is left alone for a
-while; the frame goes to another. The answer does not depend on which worker gave it.
+load spreads them. A worker that is gone is left at once; beside one that keeps silent another is
+asked, and if that answers first, the silent one is left alone for a while. The answer does not
+depend on which worker gave it, so nothing is lost by asking twice.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 from services.gateway.config import DispatchConfig
 from services.gateway.members import Members
 from services.gateway.metrics import QUARANTINES, RETRIES
+from services.gateway.race import Race
 from shared.bus import Bus, Keys
 from shared.errors import GoneError, TimedOutError, UnavailableError
 from shared.frames import TrackRequest
@@ -25,6 +28,7 @@ from shared.localization import LocalizeRequest, LocalizeResult
 from shared.tracks import TrackResult
 
 LOGGER = logging.getLogger(__name__)
+_USUAL_STEP = 0.1  # weight of the newest time in the mean
 
 
 def choose(session: str, loads: Mapping[str, int], load_cap: float) -> str:
@@ -50,8 +54,17 @@ class _Seat:
     used_s: float
 
 
+@dataclass(frozen=True)
+class Limits:
+    """How long one question may take, seconds."""
+
+    timeout_s: float  # of one worker
+    wait_s: float  # for a worker to be there
+    patience_s: float = math.inf  # then another worker is asked beside
+
+
 class TrackerPool:
-    """Asks one worker at a time for each session's frames and single images."""
+    """Asks workers for each session's frames and single images."""
 
     def __init__(self, bus: Bus, members: Members, config: DispatchConfig) -> None:
         self._bus = bus
@@ -59,50 +72,78 @@ class TrackerPool:
         self._config = config
         self._seats: dict[str, _Seat] = {}
         self._quarantined: dict[str, float] = {}  # until when, monotonic seconds
+        self._usual_s = 0.0  # what a frame takes at present
 
-    async def track(self, request: TrackRequest, timeout_s: float, wait_s: float) -> TrackResult:
-        """The answer of some worker to a frame; waits `wait_s` for one to be there.
+    async def track(self, request: TrackRequest, limits: Limits) -> TrackResult:
+        """The answer of some worker to a frame, and of the first where one kept silent too long.
 
         Raises:
             UnavailableError: no worker answers.
             PointSlamError: what the worker raised.
         """
-        return await self._ask(Keys.track, request, TrackResult, (timeout_s, wait_s))
+        start = time.monotonic()
+        patience_s = max(self._config.patience_s, self._config.patience_ratio * self._usual_s)
+        limits = replace(limits, patience_s=patience_s)
+        result = await self._ask(Keys.track, request, TrackResult, limits)
+        self._usual_s += _USUAL_STEP * (time.monotonic() - start - self._usual_s)
+        return result
 
-    async def localize(
-        self, request: LocalizeRequest, timeout_s: float, wait_s: float
-    ) -> LocalizeResult:
+    async def localize(self, request: LocalizeRequest, limits: Limits) -> LocalizeResult:
         """The answer of some worker to a single image; see `track`."""
-        return await self._ask(Keys.localize, request, LocalizeResult, (timeout_s, wait_s))
+        return await self._ask(Keys.localize, request, LocalizeResult, limits)
 
     async def _ask(
         self,
         key_of: Callable[[str], str],
         request: TrackRequest | LocalizeRequest,
         kind: type,
-        times_s: tuple[float, float],
+        limits: Limits,
     ) -> Any:
-        timeout_s, wait_s = times_s
-        failed: set[str] = set()
-        deadline = time.monotonic() + wait_s
-        while True:
-            worker = await self._pick(request.session, failed, deadline)
-            limit = timeout_s
-            if self._is_new(request.session, worker):
-                limit = max(timeout_s, self._config.first_frame_timeout_s)
-            self._seats[request.session] = _Seat(worker, time.monotonic())
-            try:
-                return await self._bus.ask(key_of(worker), request, kind, limit)
-            except GoneError:
-                RETRIES.labels("gone").inc()
-                LOGGER.warning("tracking worker %s is gone; asked by %s", worker, request.session)
-            except TimedOutError:
-                LOGGER.warning("tracking worker %s timed out after %.1f s", worker, limit)
-                self._quarantined[worker] = time.monotonic() + self._config.quarantine_s
-                RETRIES.labels("timeout").inc()
-                QUARANTINES.inc()
-            failed.add(worker)
-            self._seats.pop(request.session, None)
+        session, failed = request.session, set[str]()
+        deadline = time.monotonic() + limits.wait_s
+        race: Race[Any] = Race()
+        try:
+            while True:
+                if not race.workers or self._healthy() - failed - race.workers:
+                    worker = await self._pick(session, failed, race.workers, deadline)
+                    limit_s = self._limit_s(session, worker, limits)
+                    race.enter(worker, self._bus.ask(key_of(worker), request, kind, limit_s))
+                    self._seats[session] = _Seat(worker, time.monotonic())
+                for worker, task in await race.ended(limits.patience_s):
+                    if self._has_answered(session, worker, task):
+                        self._seats[session] = _Seat(worker, time.monotonic())
+                        self._pass_over(session, race.silent(limits.patience_s))
+                        return task.result()
+                    failed.add(worker)
+        finally:
+            race.close()
+
+    def _limit_s(self, session: str, worker: str, limits: Limits) -> float:
+        seat = self._seats.get(session)
+        if seat is None or seat.worker != worker:
+            return max(limits.timeout_s, self._config.first_frame_timeout_s)
+        return limits.timeout_s
+
+    def _has_answered(self, session: str, worker: str, task: asyncio.Task[Any]) -> bool:
+        """Whether a worker answered, if only to raise; one that did not loses its seat."""
+        error = task.exception()
+        if isinstance(error, GoneError):
+            RETRIES.labels("gone").inc()
+            LOGGER.warning("tracking worker %s is gone; asked by %s", worker, session)
+        elif isinstance(error, TimedOutError):
+            self._pass_over(session, [worker])
+        else:
+            return True
+        self._seats.pop(session, None)
+        return False
+
+    def _pass_over(self, session: str, workers: Iterable[str]) -> None:
+        """Leave workers that did not answer in time alone for a while."""
+        for worker in workers:
+            LOGGER.warning("tracking worker %s keeps silent; asked by %s", worker, session)
+            self._quarantined[worker] = time.monotonic() + self._config.quarantine_s
+            RETRIES.labels("timeout").inc()
+            QUARANTINES.inc()
 
     def count(self) -> int:
         """How many workers are alive."""
@@ -112,10 +153,13 @@ class TrackerPool:
         """Forget a session."""
         self._seats.pop(session, None)
 
-    async def _pick(self, session: str, failed: set[str], deadline: float) -> str:
+    async def _pick(
+        self, session: str, failed: set[str], under_way: set[str], deadline: float
+    ) -> str:
         while True:
             now = time.monotonic()
-            candidates = self._healthy(now) - failed
+            # Where all are in quarantine, a slow answer is better than none.
+            candidates = (self._healthy() or self._members.names) - failed - under_way
             if candidates:
                 return self._seat(session, candidates, now)
             if now >= deadline:
@@ -125,10 +169,11 @@ class TrackerPool:
             await self._members.wait_for_change(min(0.25, deadline - now))
             failed.clear()
 
-    def _healthy(self, now: float) -> set[str]:
+    def _healthy(self) -> set[str]:
+        now = time.monotonic()
         return {w for w in self._members.names if self._quarantined.get(w, 0.0) <= now}
 
-    def _seat(self, session: str, candidates: set[str], now: float) -> str:
+    def _seat(self, session: str, candidates: Set[str], now: float) -> str:
         seat = self._seats.get(session)
         if seat is not None and seat.worker in candidates:
             return seat.worker
@@ -138,7 +183,3 @@ class TrackerPool:
             if other != session and taken.worker in loads and is_active:
                 loads[taken.worker] += 1
         return choose(session, loads, self._config.load_cap)
-
-    def _is_new(self, session: str, worker: str) -> bool:
-        seat = self._seats.get(session)
-        return seat is None or seat.worker != worker

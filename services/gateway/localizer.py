@@ -13,6 +13,7 @@ from services.gateway.decode import (
     matrix_of,
     named_from,
 )
+from services.gateway.dispatch import Limits
 from services.gateway.owner import Fabric, MapOwner
 from services.gateway.poses import deviations
 from shared import codec
@@ -116,13 +117,13 @@ class Localizer:
 
     async def _ask(self, message: LocalizeMessage, map_revision: int) -> LocalizeResult:
         times = self._fabric.config.dispatch
-        timeout_s, wait_s = times.offline_timeout_s, times.offline_wait_s
+        limits = Limits(times.offline_timeout_s, times.offline_wait_s)
 
         async def ask() -> LocalizeResult:
             request = self._request(message, map_revision)
-            return await self._fabric.trackers.localize(request, timeout_s, wait_s)
+            return await self._fabric.trackers.localize(request, limits)
 
-        return await self._owner.ask_tracker(ask, wait_s)
+        return await self._owner.ask_tracker(ask, limits.wait_s)
 
     def _request(self, message: LocalizeMessage, map_revision: int) -> LocalizeRequest:
         depth, prior = message.depth, message.T_map_camera_prior

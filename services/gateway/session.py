@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 from services.gateway.delivery import Delivery
+from services.gateway.dispatch import Limits
 from services.gateway.frame_queue import FrameQueue, Outcome
 from services.gateway.localizer import Localizer
 from services.gateway.owner import Fabric, MapOwner
@@ -142,14 +143,14 @@ class Session:
 
     async def _ask_tracker(self, frame: Frame) -> TrackResult:
         dispatch = self._fabric.config.dispatch
-        timeout_s = dispatch.live_timeout_s if self.is_live else dispatch.offline_timeout_s
-        wait_s = dispatch.live_wait_s if self.is_live else dispatch.offline_wait_s
-        trackers = self._fabric.trackers
+        limits = Limits(dispatch.offline_timeout_s, dispatch.offline_wait_s)
+        if self.is_live:
+            limits = Limits(dispatch.live_timeout_s, dispatch.live_wait_s)
 
         async def ask() -> TrackResult:
-            return await trackers.track(self._request(frame), timeout_s, wait_s)
+            return await self._fabric.trackers.track(self._request(frame), limits)
 
-        return await self.owner.ask_tracker(ask, wait_s)
+        return await self.owner.ask_tracker(ask, limits.wait_s)
 
     def _request(self, frame: Frame) -> TrackRequest:
         return TrackRequest(

@@ -201,3 +201,30 @@ def wait_for(condition):
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+def test_beside_a_silent_tracker_another_is_asked_long_before_the_time_out(
+    gateway, client, calibration, rgb, depth
+):
+    session = client.create_session(calibration, mode="live")
+    session.track(rgb, depth, SECOND)
+    frozen, other = used(gateway, session)
+    frozen.delay_s = 3.0
+
+    replies = [session.track(rgb, depth, (i + 2) * SECOND) for i in range(3)]
+
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+    assert [request.frame.seq for request in other.requests] == [1, 2, 3]
+    assert len([r for r in frozen.requests if r.session == session.name]) == 2
+
+
+def test_a_slow_answer_of_the_only_tracker_is_waited_for(gateway, client, calibration, rgb, depth):
+    slow, gone = gateway.trackers
+    gone.leave()
+    slow.delay_s = 0.4
+
+    session = client.create_session(calibration, mode="live")
+    replies = [session.track(rgb, depth, (i + 1) * SECOND) for i in range(3)]
+
+    assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
+    assert [request.frame.seq for request in slow.requests] == [0, 1, 2]

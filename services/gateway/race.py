@@ -1,0 +1,46 @@
+"""One question asked of several workers, each beside those before it that are still silent."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Coroutine
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Race(Generic[T]):
+    """Questions under way, by worker; whoever answers first ends it."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[str, float] = {}
+        self._asked: dict[asyncio.Task[T], str] = {}
+
+    @property
+    def workers(self) -> set[str]:
+        """Workers that were asked and have not ended."""
+        return set(self._asked.values())
+
+    def enter(self, worker: str, question: Coroutine[Any, Any, T]) -> None:
+        """Ask one more worker."""
+        self._asked[asyncio.create_task(question)] = worker
+        self._since_s[worker] = time.monotonic()
+
+    async def ended(self, timeout_s: float) -> list[tuple[str, asyncio.Task[T]]]:
+        """Workers that have answered or failed; none when the time was over first."""
+        done, _ = await asyncio.wait(
+            self._asked, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED
+        )
+        return [(self._asked.pop(task), task) for task in done]
+
+    def silent(self, longer_than_s: float) -> list[str]:
+        """Workers that have had so much time and are still under way."""
+        now = time.monotonic()
+        return [w for w in self._asked.values() if now - self._since_s[w] > longer_than_s]
+
+    def close(self) -> None:
+        """Wait for nobody any more."""
+        for task in self._asked:
+            task.cancel()
+        self._asked.clear()
