@@ -52,7 +52,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="one setting; its key starts with tracking, mapping, gateway or sequence",
+        help="one setting; its key starts with tracking, mapping, gateway, router or sequence",
     )
     parser.add_argument("--trackers", type=int, default=2, metavar="N")
 

@@ -51,11 +51,11 @@ class Services:
         self.http_port = options.http_port or ports[0]
         self.grpc_port = options.grpc_port or ports[1]
         self.url = f"http://{_HOST}:{self.http_port}"
-        router = f"tcp/{_HOST}:{ports[2]}"
+        router = options.settings.router_endpoint() or f"tcp/{_HOST}:{ports[2]}"
         self._processes: list[ServiceProcess] = []
         options.data.mkdir(parents=True, exist_ok=True)
         try:
-            listen = Command("router", "router", "pointslam.router", ("--listen", router))
+            listen = Command("router", "router", "pointslam.router", _listen(options, router))
             deadline = time.monotonic() + START_TIMEOUT_S
             self._start(listen, options.logs).wait_ready(deadline)
             for command in self._commands(options, router):
@@ -127,6 +127,12 @@ class Services:
             *(command("mapping", name, *data) for name in mappers),
             command("gateway", "gateway-0", *http, "--grpc-port", str(self.grpc_port)),
         ]
+
+
+def _listen(options: LaunchOptions, router: str) -> tuple[str, ...]:
+    settings = options.settings
+    where = () if settings.router_endpoint() else ("--listen", router)
+    return (*where, *settings.arguments("router"))
 
 
 def free_ports(count: int) -> list[int]:

@@ -1,6 +1,6 @@
 """Settings of a run: one file and `--set` words for all services and for reading the sequence.
 
-The first part of a key says whose it is: tracking, mapping, gateway or sequence.
+The first part of a key says whose it is: tracking, mapping, gateway, router or sequence.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pointslam.datasets.base import SequenceOptions
 from shared.config import override, read_overrides
 from shared.errors import ConfigError
 
-ROLES = ("tracking", "mapping", "gateway")
+ROLES = ("tracking", "mapping", "gateway", "router")
 _SEQUENCE = "sequence"
 
 
@@ -28,6 +28,11 @@ class ServiceSettings:
     def words(self) -> tuple[str, ...]:
         """`role.key=value` words that `read_settings` takes."""
         return tuple(f"{key}={json.dumps(value)}" for key, value in _flat(self.by_role))
+
+    def router_endpoint(self) -> str | None:
+        """Where the router listens, if the settings say so."""
+        listen = self.by_role.get("router", {}).get("listen")
+        return str(listen[0]) if isinstance(listen, list) and listen else None
 
     def arguments(self, role: str) -> list[str]:
         """`--set key=value` words for a service's command line."""

@@ -1,4 +1,4 @@
-"""The zenoh fabric: keys, queries with three outcomes, publications, liveliness.
+"""The zenoh fabric: queries with three outcomes, publications, liveliness.
 
 Live data is published with small ring buffers and may be lost; what must arrive is a query with a
 reply. Multicast scouting and shared memory are off: both were measured to do harm (stale mappings,
@@ -8,7 +8,7 @@ silent loss), and TCP on one machine has 40 times the throughput that we need.
 from __future__ import annotations
 
 import asyncio
-import json
+import dataclasses
 import logging
 import time
 from collections.abc import Callable
@@ -18,104 +18,48 @@ from typing import Any
 import zenoh
 
 from shared import codec
-from shared.errors import GoneError, InputError, UnavailableError
+from shared.errors import ConfigError, GoneError, InputError, UnavailableError
+from shared.fabric import BusConfig, RouterConfig, answers, client_config, router_config
+from shared.keys import Keys
 from shared.replies import answer_query, read_reply
 
 LOGGER = logging.getLogger(__name__)
 
-MAX_MESSAGE_BYTES = 256 << 20
-_LEASE_MS = 2000
-_ROOT = "ps/v1"
+_SEEN_WITHIN_S = 2.0
 
 
-class Keys:
-    """Every key expression of the system."""
-
-    @staticmethod
-    def track(worker: str) -> str:
-        """Frames for one tracking worker (TrackRequest, TrackResult)."""
-        return f"{_ROOT}/track/{worker}/frame"
-
-    @staticmethod
-    def localize(worker: str) -> str:
-        """Single images for one tracking worker (LocalizeRequest, LocalizeResult)."""
-        return f"{_ROOT}/track/{worker}/localize"
-
-    @staticmethod
-    def mapper(mapper: str, question: str) -> str:
-        """Queries to one mapper.
-
-        open (OpenRequest, OpenReply), list (Empty, SessionList), delete (DeleteRequest, Empty).
-        """
-        return f"{_ROOT}/mapper/{mapper}/{question}"
-
-    @staticmethod
-    def session(session: str, epoch: int, question: str) -> str:
-        """Queries to the owner of a session's map in one epoch.
-
-        advance (Advance, AdvanceReply), context (ContextRequest, TrackingContext),
-        candidates (CandidatesRequest, Candidates), keyframes (Empty, KeyframePoses),
-        render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk),
-        refine (RefineRequest, JobStatus), refinement (Empty, JobStatus), interrupt (Empty,
-        JobStatus), save (SaveRequest, SaveReply), info (Empty, MapInfo),
-        trajectory (TrajectoryRequest, Trajectory).
-        """
-        return f"{_ROOT}/session/{session}/{epoch}/{question}"
-
-    @staticmethod
-    def revisions(session: str) -> str:
-        """Publications of KeyframePoses."""
-        return f"{_ROOT}/revision/{session}"
-
-    @staticmethod
-    def alive(role: str, name: str) -> str:
-        """Liveliness token of a process; role is tracking or mapping."""
-        return f"{_ROOT}/alive/{role}/{name}"
-
-
-def zenoh_config(mode: str, connect: list[str], listen: list[str]) -> zenoh.Config:
-    """Our zenoh settings: no scouting, no shared memory, short leases, bounded messages."""
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": connect,
-        "connect/timeout_ms": 3000,
-        "connect/retry": {"period_max_ms": 1000},
-        "listen/endpoints": listen,
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS,
-        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-    }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def open_router(endpoint: str) -> zenoh.Session:
-    """A router in this process.
+def open_router(endpoint: str, config: RouterConfig | None = None) -> zenoh.Session:
+    """A router in this process, listening on an endpoint besides those of its settings.
 
     Raises:
-        UnavailableError: the endpoint cannot be listened on.
+        ConfigError: a file of its settings cannot be read.
+        UnavailableError: an endpoint cannot be listened on.
     """
+    config = config or RouterConfig()
+    listen = (*([endpoint] if endpoint else []), *config.listen)
     try:
-        return zenoh.open(zenoh_config("router", [], [endpoint]))
+        return zenoh.open(router_config(dataclasses.replace(config, listen=listen)))
     except zenoh.ZError as error:
-        raise UnavailableError(f"router cannot listen on {endpoint}: {error}") from None
+        raise UnavailableError(f"router cannot listen on {', '.join(listen)}: {error}") from None
 
 
-def open_bus(endpoints: list[str], wait_s: float = 20.0) -> Bus:
-    """Connect to a router, trying for `wait_s` seconds.
+def open_bus(endpoints: list[str], config: BusConfig | None = None, wait_s: float = 20.0) -> Bus:
+    """Connect to one of several routers, trying for `wait_s` seconds.
 
     Raises:
-        UnavailableError: no router answers at any of the endpoints.
+        ConfigError: a file with our credentials cannot be read.
+        UnavailableError: no router answers at any of the endpoints, or it does not let us in.
     """
+    config = config or BusConfig()
+    settings = client_config(endpoints, config)
     deadline = time.monotonic() + wait_s
     while True:
         try:
-            return Bus(zenoh.open(zenoh_config("client", endpoints, [])))
+            return Bus(zenoh.open(settings), endpoints, config)
         except zenoh.ZError as error:
+            # zenoh has tried for seconds, and does not say why it was refused.
+            if present := answers(endpoints):
+                raise UnavailableError(_refused(present, config)) from None
             if time.monotonic() > deadline:
                 raise UnavailableError(
                     f"no zenoh router at {', '.join(endpoints)}: {error}"
@@ -123,11 +67,20 @@ def open_bus(endpoints: list[str], wait_s: float = 20.0) -> Bus:
             time.sleep(0.2)
 
 
+def _refused(present: list[str], config: BusConfig) -> str:
+    return (
+        f"{', '.join(present)} answers but does not let us in as {config.who()}: a wrong password "
+        "or certificate, or no zenoh router at all"
+    )
+
+
 class Bus:
     """One process's connection to the fabric; a context manager."""
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, endpoints: list[str], config: BusConfig) -> None:
         self._session = session
+        self._endpoints = endpoints
+        self._config = config
         self._declared: list[Any] = []
 
     def __enter__(self) -> Bus:
@@ -155,6 +108,7 @@ class Bus:
             payload=codec.pack(message),
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
+            priority=Keys.priority(key),
             timeout=timeout_s,
         )
         for reply in replies:
@@ -182,6 +136,7 @@ class Bus:
             payload=codec.pack(message),
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
+            priority=Keys.priority(key),
             timeout=timeout_s,
         )
         if (reply := await answered) is None:
@@ -222,6 +177,7 @@ class Bus:
             key,
             codec.pack(message),
             priority=zenoh.Priority.REAL_TIME,
+            express=True,
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
@@ -245,8 +201,24 @@ class Bus:
         return stop
 
     def declare_alive(self, role: str, name: str) -> None:
-        """Hold a token that vanishes with this process."""
+        """Hold a token that vanishes with this process.
+
+        Raises:
+            ConfigError: the router's access list does not let us be this role.
+        """
         self._declared.append(self._session.liveliness().declare_token(Keys.alive(role, name)))
+        if self._config.is_named:
+            self._require_seen(role, name)
+
+    def _require_seen(self, role: str, name: str) -> None:
+        """Look from a second connection: a router denies in silence, and we hear ourselves."""
+        deadline = time.monotonic() + _SEEN_WITHIN_S
+        with open_bus(self._endpoints, self._config) as witness:
+            while name not in witness.alive(role):
+                if time.monotonic() > deadline:
+                    who = self._config.who()
+                    raise ConfigError(f"the router's access list lets {who} not be {role}")
+                time.sleep(0.05)
 
     def watch_alive(self, role: str, changed: Callable[[str, bool], None]) -> None:
         """Call `changed(name, is_alive)` for each process of a role, present ones first."""
@@ -266,8 +238,12 @@ class Bus:
         Raises:
             UnavailableError: there is none; names those that there are.
         """
-        replies = self._session.liveliness().get(Keys.alive(role, "*"), timeout=3.0)
-        names = [str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None]
+        names = self.alive(role)
         if not any(name.startswith(prefix) for name in names):
             found = ", ".join(sorted(names)) or "none"
             raise UnavailableError(f"no {role} service named {prefix}* is alive; alive: {found}")
+
+    def alive(self, role: str) -> set[str]:
+        """Names of a role's processes, as the routers know them now."""
+        replies = self._session.liveliness().get(Keys.alive(role, "*"), timeout=3.0)
+        return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}

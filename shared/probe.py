@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 
 from shared.bus import open_bus
-from shared.service import endpoints, run_service
+from shared.service import bus_settings, endpoints, run_service
 
 
 def main(argv: list[str]) -> None:
@@ -16,8 +17,10 @@ def main(argv: list[str]) -> None:
     parser.add_argument("role", choices=["tracking", "mapping"])
     parser.add_argument("--connect", action="append", metavar="ENDPOINT")
     parser.add_argument("--prefix", default=os.uname().nodename, help="start of the service's --id")
+    parser.add_argument("--config", type=Path, help="the service's settings: how it connects")
     arguments = parser.parse_args(argv)
-    with open_bus(endpoints(arguments), wait_s=3.0) as bus:
+    config = bus_settings(arguments.config)
+    with open_bus(endpoints(arguments), config, wait_s=3.0) as bus:
         bus.require_alive(arguments.role, arguments.prefix)
 
 

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from shared.config import override, read_overrides
-from shared.errors import PointSlamError
+from shared.errors import ConfigError, PointSlamError
+from shared.fabric import BusConfig
 
 C = TypeVar("C")
 
@@ -45,6 +46,18 @@ def settings_from(arguments: argparse.Namespace, defaults: C) -> C:
         ConfigError: a key is unknown or a value does not fit.
     """
     return override(defaults, read_overrides(arguments.config, arguments.set))
+
+
+def bus_settings(file: Path | None) -> BusConfig:
+    """The connection's part of a service's settings file, for who is not the service itself.
+
+    Raises:
+        ConfigError: as `settings_from`.
+    """
+    group = read_overrides(file, ()).get("bus", {})
+    if not isinstance(group, dict):
+        raise ConfigError(f"bus is a group of settings, got {group!r}")
+    return override(BusConfig(), group, "bus.")
 
 
 def endpoints(arguments: argparse.Namespace) -> list[str]:

@@ -54,7 +54,7 @@ def main(argv: list[str]) -> None:
     setup_logging(arguments.json_log)
     config = settings_from(arguments, GatewayConfig())
     listener = _listen(arguments.http_host, arguments.http_port)
-    with listener, open_bus(endpoints(arguments)) as bus:
+    with listener, open_bus(endpoints(arguments), config.bus) as bus:
         loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
         with asyncio.Runner(loop_factory=loop_factory) as runner:
             runner.run(_serve(bus, config, listener, arguments))

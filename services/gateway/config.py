@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from shared.errors import ConfigError
+from shared.fabric import BusConfig
 
 
 def _check_positive(config: object, *names: str) -> None:
@@ -101,4 +102,5 @@ class GatewayConfig:
     dispatch: DispatchConfig = field(default_factory=DispatchConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
     drain_s: float = 10.0  # time to finish what is in flight at SIGTERM

@@ -58,7 +58,7 @@ def main(argv: list[str]) -> None:
     serve_metrics(arguments)
     warm_up()
     others_give_way(settings.config.owner.niceness)
-    with open_bus(endpoints(arguments)) as bus:
+    with open_bus(endpoints(arguments), settings.config.bus) as bus:
         host = MapperHost(bus, settings)
         SessionCollector(host.infos)
         host.start()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from services.mapping.keyframes import KeyframeConfig
 from shared.errors import ConfigError
+from shared.fabric import BusConfig
 
 
 def _check(is_fine: bool, text: str) -> None:
@@ -202,4 +203,5 @@ class MappingConfig:
     render: RenderConfig = field(default_factory=RenderConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
     owner: OwnerConfig = field(default_factory=OwnerConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)

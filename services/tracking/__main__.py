@@ -49,7 +49,7 @@ def main(argv: list[str]) -> None:
     serve_metrics(arguments)
     warm_up(config)
     with (
-        open_bus(endpoints(arguments)) as bus,
+        open_bus(endpoints(arguments), config.bus) as bus,
         ThreadPoolExecutor(config.concurrent_frames, "frame") as executor,
         ThreadPoolExecutor(1, "localize") as beside,  # no frame waits for a search of the map
     ):

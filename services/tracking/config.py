@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from shared.errors import ConfigError
+from shared.fabric import BusConfig
 
 
 def _require_positive(config: object, *names: str) -> None:
@@ -211,6 +212,7 @@ class TrackingConfig:
     loop: LoopVerificationConfig = field(default_factory=LoopVerificationConfig)
     keyframe: KeyframeRuleConfig = field(default_factory=KeyframeRuleConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
     context_cache: int = 8  # contexts kept, over all sessions
     concurrent_frames: int = 2
     query_timeout_s: float = 5.0

@@ -1,0 +1,67 @@
+"""Every key expression of the bus, and how urgent what it carries is."""
+
+from __future__ import annotations
+
+from zenoh import Priority
+
+ROOT = "ps/v1"
+
+
+class Keys:
+    """Every key expression of the system."""
+
+    @staticmethod
+    def track(worker: str) -> str:
+        """Frames for one tracking worker (TrackRequest, TrackResult)."""
+        return f"{ROOT}/track/{worker}/frame"
+
+    @staticmethod
+    def localize(worker: str) -> str:
+        """Single images for one tracking worker (LocalizeRequest, LocalizeResult)."""
+        return f"{ROOT}/track/{worker}/localize"
+
+    @staticmethod
+    def mapper(mapper: str, question: str) -> str:
+        """Queries to one mapper.
+
+        open (OpenRequest, OpenReply), list (Empty, SessionList), delete (DeleteRequest, Empty).
+        """
+        return f"{ROOT}/mapper/{mapper}/{question}"
+
+    @staticmethod
+    def session(session: str, epoch: int, question: str) -> str:
+        """Queries to the owner of a session's map in one epoch.
+
+        advance (Advance, AdvanceReply), context (ContextRequest, TrackingContext),
+        candidates (CandidatesRequest, Candidates), keyframes (Empty, KeyframePoses),
+        render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk),
+        refine (RefineRequest, JobStatus), refinement (Empty, JobStatus), interrupt (Empty,
+        JobStatus), save (SaveRequest, SaveReply), info (Empty, MapInfo),
+        trajectory (TrajectoryRequest, Trajectory).
+        """
+        return f"{ROOT}/session/{session}/{epoch}/{question}"
+
+    @staticmethod
+    def revisions(session: str) -> str:
+        """Publications of KeyframePoses."""
+        return f"{ROOT}/revision/{session}"
+
+    @staticmethod
+    def alive(role: str, name: str) -> str:
+        """Liveliness token of a process; role is tracking or mapping."""
+        return f"{ROOT}/alive/{role}/{name}"
+
+    @staticmethod
+    def priority(key: str) -> Priority:
+        """Of a question and its answer: what a camera waits for before what a person waits for."""
+        return _PRIORITIES.get(key.rpartition("/")[2], Priority.DATA)
+
+
+_PRIORITIES = {
+    "context": Priority.DATA_HIGH,
+    "candidates": Priority.DATA_HIGH,
+    "localize": Priority.DATA_LOW,
+    "render": Priority.DATA_LOW,
+    "trajectory": Priority.DATA_LOW,
+    "export": Priority.BACKGROUND,
+}
