@@ -175,7 +175,9 @@ class KeyframeRuleConfig:
     max_turn_deg: float = 15.0
     max_step_share: float = 0.12  # of the median depth
     max_added_blur_px: float = 1.6  # at 640x480, beside the keyframes around: 6 px of motion
-    min_blurred_overlap: float = 0.4  # below it a blurred keyframe is better than losing the camera
+    # Below one of these a blurred keyframe is better than losing the camera.
+    min_blurred_overlap: float = 0.4
+    min_blurred_landmarks: int = 100
 
     def __post_init__(self) -> None:
         _require_positive(self, "max_interval", "max_cloud_points", "max_added_blur_px")

@@ -33,6 +33,7 @@ class Coverage:
 
     num_points: int  # of the frame's surface
     overlap: float  # share of the frame's surface that the map has
+    landmarks: int  # that its features agree with
     landmark_share: float  # share of its features with depth that are landmarks
     T_reference_camera: NDArray[np.float64]  # [4, 4]
     median_depth_m: float
@@ -64,7 +65,11 @@ def is_too_blurred(
     """Far less sharp than the keyframes around, while these still show enough to wait."""
     scale = np.sqrt(intrinsics.width * intrinsics.height / BASE_PIXELS)
     is_blurred = sharpness.added_blur_px > config.max_added_blur_px * scale
-    return bool(is_blurred and coverage.overlap >= config.min_blurred_overlap)
+    can_wait = (
+        coverage.overlap >= config.min_blurred_overlap
+        and coverage.landmarks >= config.min_blurred_landmarks
+    )
+    return bool(is_blurred and can_wait)
 
 
 def becomes_keyframe(

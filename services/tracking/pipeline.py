@@ -178,6 +178,7 @@ def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
     return Coverage(
         num_points=len(observed.cloud.points),
         overlap=estimate.registration.overlap,
+        landmarks=estimate.inliers,
         landmark_share=estimate.inliers / max(1, with_depth),
         T_reference_camera=inverse(T_world_reference) @ estimate.T_world_camera,
         median_depth_m=_median_depth(observed),

@@ -60,8 +60,8 @@ def test_an_image_without_edges_has_no_blur_to_speak_of():
     assert edge_blur_px(np.full((480, 640, 3), 90, np.uint8)) == 0.0
 
 
-def covered(overlap: float) -> Coverage:
-    return Coverage(9000, overlap, 0.5, np.eye(4), 2.0)
+def covered(overlap: float, landmarks: int = 300) -> Coverage:
+    return Coverage(9000, overlap, landmarks, 0.5, np.eye(4), 2.0)
 
 
 @pytest.mark.parametrize(("edge_blur", "refused"), [(1.2, False), (1.8, False), (2.4, True)])
@@ -81,6 +81,12 @@ def test_where_the_map_is_about_to_end_a_blurred_keyframe_is_better_than_none():
     sharpness = Sharpness(4.0, usual_blur_px=1.1)
 
     assert not is_too_blurred(sharpness, covered(0.3), VGA, KeyframeRuleConfig())
+
+
+def test_where_hardly_any_landmark_is_left_a_blurred_keyframe_is_better_than_none():
+    sharpness = Sharpness(4.0, usual_blur_px=1.1)
+
+    assert not is_too_blurred(sharpness, covered(0.7, landmarks=60), VGA, KeyframeRuleConfig())
 
 
 def test_without_keyframes_of_known_blur_a_frame_is_its_own_measure():
