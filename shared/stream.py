@@ -68,7 +68,8 @@ class FrameReply:
     """The answer to one frame: a pose and how good it is, or an error that says why not.
 
     `pos_std_m` and `rot_std_deg` are one standard deviation. `credit` is how many frames the
-    client may send before the next reply.
+    client may send before the next reply. `map_problem` says why a live map does not grow at
+    present (a full disk, no owner): poses go on, keyframes wait.
     """
 
     seq: int
@@ -85,3 +86,4 @@ class FrameReply:
     timings_ms: dict[str, float] = field(default_factory=dict)
     credit: int = 1
     error: ErrorDetail | None = None
+    map_problem: ErrorDetail | None = None

@@ -71,7 +71,7 @@ class MappingConfig:
     reopen_wait_s: float = 60.0  # how long a session waits for a live mapper
     retry_s: float = 0.2
     live_entries: int = 256  # answered frames that a live session holds unacknowledged
-    keyframe_wait_s: float = 2.0  # a live session waits so long for a keyframe's acknowledgement
+    keyframe_wait_s: float = 0.25  # a live session waits so long for a keyframe's acknowledgement
 
     def __post_init__(self) -> None:
         _check_positive(self, "advance_timeout_s", "question_timeout_s", "retry_s", "live_entries")

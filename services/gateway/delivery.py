@@ -8,7 +8,7 @@ from collections import deque
 
 from services.gateway.config import MappingConfig
 from services.gateway.owner import MapOwner
-from shared.errors import ConflictError, InputError, PointSlamError
+from shared.errors import ConflictError, InputError, PointSlamError, UnavailableError
 from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
@@ -56,10 +56,36 @@ class Delivery:
             return False
         return True
 
+    @property
+    def holds_keyframe(self) -> bool:
+        """Whether a keyframe waits that trackers cannot see in the map yet."""
+        return any(entry.keyframe is not None for entry in self._entries)
+
+    @property
+    def problem(self) -> PointSlamError | None:
+        """Why the map does not grow at present; None when it does."""
+        if self._entries and self._owner.lost.is_set():
+            return UnavailableError("the map has no owner at present")
+        return self._failure
+
+    async def settle(self, timeout_s: float) -> None:
+        """Wait until all entries are acknowledged or refused, or the map has lost its owner."""
+        ends = [
+            asyncio.create_task(self._taken_or_refused()),
+            asyncio.create_task(self._owner.lost.wait()),
+        ]
+        await asyncio.wait(ends, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+        for end in ends:
+            end.cancel()
+
     def close(self) -> None:
         """Give up what is not acknowledged."""
         if self._task is not None:
             self._task.cancel()
+
+    async def _taken_or_refused(self) -> None:
+        async with self._changed:
+            await self._changed.wait_for(lambda: not self._entries or self._failure is not None)
 
     async def _send_all(self) -> None:
         while self._entries:
@@ -71,7 +97,8 @@ class Delivery:
                 seq = self._entries[0].record.seq
                 LOGGER.error("%s: frame %d is not in the map: %s", self._owner.session, seq, error)
             except PointSlamError as error:
-                LOGGER.warning("%s: map entry not taken: %s", self._owner.session, error)
+                if str(error) != str(self._failure):
+                    LOGGER.warning("%s: map entry not taken: %s", self._owner.session, error)
                 await self._tell(error)
                 await asyncio.sleep(self._config.retry_s)
                 continue

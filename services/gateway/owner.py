@@ -53,6 +53,7 @@ class MapOwner:
         self._fabric = fabric
         self._config = fabric.config.mapping
         self._reopening = asyncio.Lock()
+        self.lost = asyncio.Event()  # set while nobody is known to own the map
         loop = asyncio.get_running_loop()
 
         def heard(poses: KeyframePoses) -> None:
@@ -123,8 +124,10 @@ class MapOwner:
         """
         async with self._reopening:
             while self.epoch == epoch:
+                self.lost.set()
                 await asyncio.sleep(self._config.retry_s)
                 if await self._is_back() or await self._open_anywhere():
+                    self.lost.clear()
                     return
                 if time.monotonic() > deadline:
                     raise UnavailableError(f"no mapper has session {self.session} at present")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import logging
+import dataclasses
 import time
 from typing import Any
 
 from services.gateway.delivery import Delivery
 from services.gateway.dispatch import Limits
+from services.gateway.errors import detail
 from services.gateway.frame_queue import FrameQueue, Outcome
 from services.gateway.localizer import Localizer
 from services.gateway.owner import Fabric, MapOwner
@@ -20,8 +21,6 @@ from shared.localization import LocalizeMessage, LocalizeReply
 from shared.se3 import Pose
 from shared.stream import FrameMessage, FrameReply
 from shared.tracks import Advance, OpenReply, TrackResult
-
-LOGGER = logging.getLogger(__name__)
 
 
 class Session:
@@ -139,7 +138,9 @@ class Session:
         self._poses.add(entry.record, result.map_revision)
         self._tell_watchers()
         total_ms = 1e3 * (time.perf_counter() - start)
-        return _reply(result, {"queue": waited_ms, "gateway": total_ms})
+        reply = _reply(result, {"queue": waited_ms, "gateway": total_ms})
+        problem = self._delivery.problem
+        return reply if problem is None else dataclasses.replace(reply, map_problem=detail(problem))
 
     async def _ask_tracker(self, frame: Frame) -> TrackResult:
         dispatch = self._fabric.config.dispatch
@@ -153,6 +154,9 @@ class Session:
         return await self.owner.ask_tracker(ask, limits.wait_s)
 
     def _request(self, frame: Frame) -> TrackRequest:
+        if self._delivery.holds_keyframe:
+            # It would cover what a keyframe that trackers cannot see yet covers already.
+            frame = dataclasses.replace(frame, may_be_keyframe=False)
         return TrackRequest(
             session=self.name,
             epoch=self.owner.epoch,
@@ -161,6 +165,7 @@ class Session:
             frame=frame,
             prior=self._prior,
             T_world_first=self._T_world_first,
+            accepts_older_map=self.is_live,
         )
 
     async def _deliver(self, entry: Advance) -> None:
@@ -170,9 +175,7 @@ class Session:
         await self._delivery.put(entry)
         if entry.keyframe is not None:
             # Trackers ask for the neighbourhood of this keyframe with the next frame.
-            wait_s = self._fabric.config.mapping.keyframe_wait_s
-            if not await self._delivery.flush(wait_s):
-                LOGGER.warning("%s: keyframe %d not in the map yet", self.name, entry.record.seq)
+            await self._delivery.settle(self._fabric.config.mapping.keyframe_wait_s)
 
     def _tell_watchers(self) -> None:
         for queue in self._watchers:

@@ -14,7 +14,13 @@ from shared.errors import InputError
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
 from shared.localization import LocalizationStatus, LocalizeMessage, LocalizeReply
 from shared.se3 import Pose, Quaternion, Vector3
-from shared.stream import DepthMessage, FrameMessage, FrameReply, PriorMessage
+from shared.stream import (
+    DepthMessage,
+    ErrorDetail,
+    FrameMessage,
+    FrameReply,
+    PriorMessage,
+)
 from shared.wire import pose_service_pb2, tracking_service_pb2, types_pb2
 
 _COLOUR = {
@@ -183,7 +189,7 @@ def localized_to(reply: LocalizeReply) -> tracking_service_pb2.LocalizeResponse:
 
 def reply_to(reply: FrameReply) -> tracking_service_pb2.TrackFramesResponse:
     """A frame's reply."""
-    pose, error = reply.T_map_camera, reply.error
+    pose = reply.T_map_camera
     return tracking_service_pb2.TrackFramesResponse(
         seq=reply.seq,
         t_ns=reply.t_ns,
@@ -198,10 +204,15 @@ def reply_to(reply: FrameReply) -> tracking_service_pb2.TrackFramesResponse:
         keyframe=reply.keyframe,
         timings_ms=reply.timings_ms,
         credit=reply.credit,
-        error=types_pb2.ErrorDetail(code=error.code, field=error.field, reason=error.reason)
-        if error
-        else None,
+        error=_detail_message(reply.error),
+        map_problem=_detail_message(reply.map_problem),
     )
+
+
+def _detail_message(detail: ErrorDetail | None) -> types_pb2.ErrorDetail | None:
+    if detail is None:
+        return None
+    return types_pb2.ErrorDetail(code=detail.code, field=detail.field, reason=detail.reason)
 
 
 def timed_pose_to(pose: TimedPose) -> pose_service_pb2.TimedPose:

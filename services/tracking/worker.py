@@ -1,4 +1,8 @@
-"""A worker on the bus: fetches and caches contexts, answers frames. Its memory is only a cache."""
+"""A worker on the bus: fetches and caches contexts, answers frames. Its memory is only a cache.
+
+Offline an answer never depends on what is cached. A live frame whose map has no owner at present is
+tracked in the last neighbourhood that this worker had of its session.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from services.tracking.local_map import LocalMap, derive
 from services.tracking.localization import localize
 from services.tracking.pipeline import track
 from shared.bus import Bus, Keys
+from shared.errors import UnavailableError
 from shared.frames import TrackRequest
 from shared.localization import LocalizeRequest, LocalizeResult
 from shared.tracks import (
@@ -45,6 +50,13 @@ class ContextCache:
                 self._maps.move_to_end(key)
             return self._maps.get(key)
 
+    def newest(self, session: str) -> LocalMap | None:
+        """The most recently used map of a session, of what is near to a keyframe in any way."""
+        with self._lock:
+            of_session = (k for k in reversed(self._maps) if k[0] == session and not k[4])
+            key = next(of_session, None)
+            return None if key is None else self._maps[key]
+
     def put(self, key: ContextKey, local: LocalMap) -> None:
         """Keep a map; the least recently used one leaves when there are too many."""
         with self._lock:
@@ -75,10 +87,24 @@ class BusSource:
         self._ahead[reference_seq] = executor.submit(self._local_map, reference_seq)
 
     def local_map(self, reference_seq: int) -> LocalMap:
-        """The neighbourhood of a keyframe, from the cache where it is there."""
-        if reference_seq in self._ahead:
-            return self._ahead[reference_seq].result()
-        return self._local_map(reference_seq)
+        """The neighbourhood of a keyframe, from the cache where it is there.
+
+        An older one of the session where that will do and the owner is absent or keeps silent.
+        """
+        ahead = self._ahead.get(reference_seq)
+        if ahead is None:
+            return self._local_map(reference_seq)
+        older = self._older_map()
+        if older is None:
+            return ahead.result()
+        try:
+            return ahead.result(self._config.map_patience_s)
+        except (UnavailableError, TimeoutError):
+            return older  # what comes late is there for the next frame
+
+    def _older_map(self) -> LocalMap | None:
+        is_accepted = isinstance(self._request, TrackRequest) and self._request.accepts_older_map
+        return self._cache.newest(self._request.session) if is_accepted else None
 
     def loop_map(self, seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, of what is near to it in the graph only."""
@@ -97,8 +123,14 @@ class BusSource:
         return local
 
     def candidates(self, request: CandidatesRequest) -> Candidates:
-        """Keyframes that look like a frame."""
-        return self._ask("candidates", request, Candidates)
+        """Keyframes that look like a frame; none where an older map must do."""
+        try:
+            return self._ask("candidates", request, Candidates)
+        except UnavailableError:
+            older = self._older_map()
+            if older is None:
+                raise
+            return Candidates(older.context.revision, ())
 
     def _ask(self, question: str, message: object, kind: type) -> Any:
         key = Keys.session(self._request.session, self._request.epoch, question)

@@ -90,7 +90,7 @@ class TrackFramesRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ..., frame: _Optional[_Union[Frame, _Mapping]] = ...) -> None: ...
 
 class TrackFramesResponse(_message.Message):
-    __slots__ = ("seq", "t_ns", "status", "T_map_camera", "pos_std_m", "rot_std_deg", "inliers", "inlier_share", "reference_seq", "map_revision", "keyframe", "timings_ms", "credit", "error")
+    __slots__ = ("seq", "t_ns", "status", "T_map_camera", "pos_std_m", "rot_std_deg", "inliers", "inlier_share", "reference_seq", "map_revision", "keyframe", "timings_ms", "credit", "error", "map_problem")
     class TimingsMsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -112,6 +112,7 @@ class TrackFramesResponse(_message.Message):
     TIMINGS_MS_FIELD_NUMBER: _ClassVar[int]
     CREDIT_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
+    MAP_PROBLEM_FIELD_NUMBER: _ClassVar[int]
     seq: int
     t_ns: int
     status: _types_pb2.TrackingStatus
@@ -126,7 +127,8 @@ class TrackFramesResponse(_message.Message):
     timings_ms: _containers.ScalarMap[str, float]
     credit: int
     error: _types_pb2.ErrorDetail
-    def __init__(self, seq: _Optional[int] = ..., t_ns: _Optional[int] = ..., status: _Optional[_Union[_types_pb2.TrackingStatus, str]] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., pos_std_m: _Optional[float] = ..., rot_std_deg: _Optional[float] = ..., inliers: _Optional[int] = ..., inlier_share: _Optional[float] = ..., reference_seq: _Optional[int] = ..., map_revision: _Optional[int] = ..., keyframe: _Optional[bool] = ..., timings_ms: _Optional[_Mapping[str, float]] = ..., credit: _Optional[int] = ..., error: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ...) -> None: ...
+    map_problem: _types_pb2.ErrorDetail
+    def __init__(self, seq: _Optional[int] = ..., t_ns: _Optional[int] = ..., status: _Optional[_Union[_types_pb2.TrackingStatus, str]] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., pos_std_m: _Optional[float] = ..., rot_std_deg: _Optional[float] = ..., inliers: _Optional[int] = ..., inlier_share: _Optional[float] = ..., reference_seq: _Optional[int] = ..., map_revision: _Optional[int] = ..., keyframe: _Optional[bool] = ..., timings_ms: _Optional[_Mapping[str, float]] = ..., credit: _Optional[int] = ..., error: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ..., map_problem: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ...) -> None: ...
 
 class LocalizeRequest(_message.Message):
     __slots__ = ("session_id", "rgb", "depth", "T_map_camera_prior", "calibration", "camera")

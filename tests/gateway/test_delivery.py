@@ -10,7 +10,7 @@ import pytest
 
 from services.gateway.config import MappingConfig
 from services.gateway.delivery import Delivery
-from shared.errors import ConflictError, InputError, UnavailableError
+from shared.errors import ConflictError, InputError, StorageError, UnavailableError
 from shared.frames import TrackingStatus
 from shared.tracks import Advance, FrameRecord
 
@@ -18,6 +18,12 @@ from shared.tracks import Advance, FrameRecord
 def entry(seq):
     T = np.eye(4)
     return Advance(FrameRecord(seq, seq, TrackingStatus.TRACKED, 0, T, T, np.eye(6)))
+
+
+def to_owner(advance, lost=None):
+    owner = SimpleNamespace(session="room", logged_seq=-1, advance=advance)
+    owner.lost = lost or asyncio.Event()
+    return Delivery(owner, MappingConfig(retry_s=0.01))  # pyright: ignore[reportArgumentType]
 
 
 async def delivered(refusals):
@@ -29,8 +35,7 @@ async def delivered(refusals):
             raise error
         taken.append(entry.record.seq)
 
-    owner = SimpleNamespace(session="room", logged_seq=-1, advance=advance)
-    delivery = Delivery(owner, MappingConfig(retry_s=0.01))  # pyright: ignore[reportArgumentType]
+    delivery = to_owner(advance)
     for seq in range(3):
         await delivery.put(entry(seq))
     assert await delivery.flush(5.0)
@@ -44,3 +49,41 @@ def test_an_entry_that_is_refused_for_good_does_not_hold_up_the_others(error):
 
 def test_an_entry_that_finds_no_owner_is_sent_again():
     assert asyncio.run(delivered({1: UnavailableError("gone")})) == [0, 1, 2]
+
+
+def test_a_full_disk_is_told_until_there_is_room_and_nothing_is_lost():
+    async def run():
+        taken, is_full = [], asyncio.Event()
+        is_full.set()
+
+        async def advance(entry):
+            if is_full.is_set():
+                raise StorageError("no space left")
+            taken.append(entry.record.seq)
+
+        delivery = to_owner(advance)
+        await delivery.put(entry(0))
+        await delivery.settle(10.0)
+        problem = delivery.problem
+        is_full.clear()
+        await delivery.flush(10.0)
+        return str(problem), delivery.problem, taken
+
+    assert asyncio.run(run()) == ("no space left", None, [0])
+
+
+def test_nobody_waits_for_an_owner_that_is_lost():
+    async def run():
+        lost, never = asyncio.Event(), asyncio.Event()
+
+        async def advance(entry):
+            lost.set()
+            await never.wait()
+
+        delivery = to_owner(advance, lost)
+        await delivery.put(entry(0))
+        await asyncio.wait_for(delivery.settle(60.0), 10.0)
+        delivery.close()
+        return str(delivery.problem)
+
+    assert "no owner" in asyncio.run(run())

@@ -97,6 +97,26 @@ def test_a_fresh_worker_gives_the_bits_of_a_warm_one(bus, asked, session, room):
     assert (a.inliers, a.reference_seq, a.status) == (b.inliers, b.reference_seq, b.status)
 
 
+def test_a_live_frame_without_an_owner_is_tracked_in_the_last_neighbourhood(bus, session, room):
+    worker = Worker(bus, TrackingConfig(query_timeout_s=2.0))
+    stop = bus.serve(
+        Keys.session("test", 1, "context"),
+        ContextRequest,
+        lambda request: session.store.context(request.reference_seq),
+    )
+    session.track(room.frame(0, step(0)))
+    worker.answer(session.request(room.frame(1, step(1))))
+    stop()
+    later = dataclasses.replace(session.request(room.frame(2, step(2))), epoch=2)
+
+    with pytest.raises(UnavailableError):
+        worker.answer(later)
+    result = worker.answer(dataclasses.replace(later, accepts_older_map=True))
+
+    assert (result.status, result.map_revision) == (TrackingStatus.TRACKED, 1)
+    np.testing.assert_allclose(result.T_world_camera, step(2), atol=2e-3)
+
+
 def test_an_impossible_calibration_is_refused_by_name(bus, session, room):
     request = session.request(room.frame(0, np.eye(4)))
     camera = dataclasses.replace(room.intrinsics, fx=float("nan"))
