@@ -62,10 +62,13 @@ def local_gateway(num_trackers: int = 1, *settings: str) -> Iterator[LocalGatewa
 
 @contextmanager
 def gateway_process(
-    router: str, ports: tuple[int, int], *settings: str
+    router: str,
+    ports: tuple[int, int],
+    *settings: str,
+    access: tuple[str, ...] = ("--insecure-local",),
 ) -> Iterator[subprocess.Popen[str]]:
     """A gateway process, from when it is ready until it has ended."""
-    command = [sys.executable, "-m", "services.gateway", "--connect", router]
+    command = [sys.executable, "-m", "services.gateway", "--connect", router, *access]
     command += ["--http-port", str(ports[0]), "--grpc-port", str(ports[1])]
     command += [word for setting in settings for word in ("--set", setting)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}

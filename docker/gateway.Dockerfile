@@ -9,10 +9,10 @@ COPY pyproject.toml README.md requirements.lock ./
 COPY shared/ shared/
 COPY services/__init__.py services/__init__.py
 COPY services/gateway/ services/gateway/
-COPY pointslam/__init__.py pointslam/__init__.py
+COPY pointslam/__init__.py pointslam/keys.py pointslam/
 RUN pip install --no-cache-dir -c requirements.lock ".[gateway]" \
     && useradd --create-home --uid 10001 pointslam \
-    && mkdir -p /data && chown pointslam /data /app
+    && mkdir -p /data /keys && chown pointslam /data /keys /app
 USER pointslam
 EXPOSE 8080 50051
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s \

@@ -1,4 +1,4 @@
-"""The command line: `pointslam run | evaluate | up | synth | refine | export | bench`."""
+"""The command line: `pointslam run | evaluate | up | keys | synth | refine | export | bench`."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands.add_parser("run", help="stream a sequence and score the result"))
     _add_evaluate(commands.add_parser("evaluate", help="score a finished run again"))
     _add_up(commands.add_parser("up", help="start the services and keep them running"))
+    _add_keys(commands.add_parser("keys", help="who may use a gateway"))
     _add_synth(commands.add_parser("synth", help="render a procedural room with exact truth"))
     _add_refine(commands.add_parser("refine", help="optimise a session's map further"))
     _add_export(commands.add_parser("export", help="a run's or a session's map as a file"))
@@ -119,14 +120,19 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--http-port", type=int, default=8080, metavar="P")
     parser.add_argument("--grpc-port", type=int, default=50051, metavar="P")
     parser.add_argument("--mappers", type=int, default=1, metavar="N", help="share the sessions")
+    parser.add_argument("--host", default="127.0.0.1", help="other than loopback needs --keys")
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="only with a key of this store")
+    parser.add_argument("--tls-certificate", type=Path, metavar="FILE", help="PEM, with its chain")
+    parser.add_argument("--tls-key", type=Path, metavar="FILE", help="PEM")
     _add_settings(parser)
     parser.set_defaults(command=_up)
 
 
 def _up(arguments: argparse.Namespace) -> None:
-    from pointslam.launcher import LaunchOptions
+    from pointslam.launcher import Access, LaunchOptions
     from pointslam.up import keep_up
 
+    access = Access(arguments.host, arguments.keys, arguments.tls_certificate, arguments.tls_key)
     options = LaunchOptions(
         data=arguments.data,
         logs=arguments.data / "logs",
@@ -135,9 +141,21 @@ def _up(arguments: argparse.Namespace) -> None:
         device=arguments.device,
         http_port=arguments.http_port,
         grpc_port=arguments.grpc_port,
+        access=access,
         settings=read_settings(arguments.config, arguments.set).services,
     )
     keep_up(options, _say)
+
+
+def _add_keys(parser: argparse.ArgumentParser) -> None:
+    from pointslam.keys import add_key_commands
+
+    add_key_commands(parser)
+    parser.set_defaults(command=_keys)
+
+
+def _keys(arguments: argparse.Namespace) -> None:
+    _say(arguments.keys_command(arguments))
 
 
 def _add_synth(parser: argparse.ArgumentParser) -> None:

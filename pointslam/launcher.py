@@ -18,6 +18,35 @@ _HOST = "127.0.0.1"
 
 
 @dataclass(frozen=True)
+class Access:
+    """Who may use the gateway: by default whoever is on this machine, else who has a key.
+
+    The files are those of `pointslam keys create` and of a certificate with its private key (PEM).
+    """
+
+    host: str = _HOST
+    keys: Path | None = None
+    tls_certificate: Path | None = None
+    tls_key: Path | None = None
+
+    def arguments(self) -> tuple[str, ...]:
+        """Words of the gateway's command line."""
+        files = {
+            "--keys": self.keys,
+            "--tls-certificate": self.tls_certificate,
+            "--tls-key": self.tls_key,
+        }
+        words = [word for name, file in files.items() if file for word in (name, str(file))]
+        return tuple(words) if self.keys else ("--insecure-local", *words)
+
+    def url(self, port: int) -> str:
+        """Where the gateway is found from this machine."""
+        scheme = "http" if self.tls_certificate is None else "https"
+        host = _HOST if self.host in ("0.0.0.0", "::") else self.host
+        return f"{scheme}://{host}:{port}"
+
+
+@dataclass(frozen=True)
 class LaunchOptions:
     """What to start. Ports of 0 are chosen; `data` holds the sessions' maps."""
 
@@ -28,6 +57,7 @@ class LaunchOptions:
     http_port: int = 0
     grpc_port: int = 0
     num_mappers: int = 1
+    access: Access = field(default_factory=Access)
     settings: ServiceSettings = field(default_factory=ServiceSettings)
 
     def __post_init__(self) -> None:
@@ -50,7 +80,7 @@ class Services:
         ports = free_ports(3)
         self.http_port = options.http_port or ports[0]
         self.grpc_port = options.grpc_port or ports[1]
-        self.url = f"http://{_HOST}:{self.http_port}"
+        self.url = options.access.url(self.http_port)
         router = options.settings.router_endpoint() or f"tcp/{_HOST}:{ports[2]}"
         self._processes: list[ServiceProcess] = []
         options.data.mkdir(parents=True, exist_ok=True)
@@ -120,12 +150,13 @@ class Services:
 
         trackers = [f"tracker-{i}" for i in range(options.num_trackers)]
         mappers = [f"mapper-{i}" for i in range(options.num_mappers)]
-        http = ("--http-host", _HOST, "--http-port", str(self.http_port))
+        http = ("--http-host", options.access.host, "--http-port", str(self.http_port))
+        grpc = ("--grpc-port", str(self.grpc_port))
         data = ("--data", str(options.data), "--device", options.device)
         return [
             *(command("tracking", name) for name in trackers),
             *(command("mapping", name, *data) for name in mappers),
-            command("gateway", "gateway-0", *http, "--grpc-port", str(self.grpc_port)),
+            command("gateway", "gateway-0", *http, *options.access.arguments(), *grpc),
         ]
 
 

@@ -19,7 +19,7 @@ def keep_up(options: LaunchOptions, say: Callable[[str], None]) -> None:
     stop = stop_event()
     with Services(options) as services:
         say(f"http {services.url}  (API: {services.url}/docs)")
-        say(f"grpc 127.0.0.1:{services.grpc_port}")
+        say(f"grpc {options.access.host}:{services.grpc_port}")
         say(f"maps {options.data}, logs {options.logs}; Ctrl-C ends")
         while not stop.wait(_LOOK_EVERY_S):
             for name in services.restart_ended():

@@ -73,3 +73,25 @@ class StorageError(PointSlamError):
     """The disk refused (full, read-only) or holds a file that fails its checksum."""
 
     code = "storage"
+
+
+class UnauthenticatedError(PointSlamError):
+    """A request without a key that is known and valid."""
+
+    code = "unauthenticated"
+
+
+class ForbiddenError(PointSlamError):
+    """A key that is known but may not do this."""
+
+    code = "forbidden"
+
+
+class RateLimitedError(PointSlamError):
+    """A key has asked for more than its share: try again after `retry_after_s` seconds."""
+
+    code = "rate_limited"
+
+    def __init__(self, message: str, retry_after_s: float = 1.0) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s

@@ -66,7 +66,9 @@ class AsyncSession:
 
     async def stream(self, frames: AsyncIterable[FrameMessage]) -> AsyncIterator[FrameReply]:
         """Send frames over a WebSocket and yield their replies in order; see `Session.stream`."""
-        async with _open(calls.stream_url(self._client.url, self.name)) as connection:
+        async with _open(
+            calls.stream_url(self._client.url, self.name), self._client.headers
+        ) as connection:
             credit = asyncio.Semaphore(self._credit) if self.mode == "offline" else None
             sent: asyncio.Queue[bool] = asyncio.Queue()
             sender = asyncio.create_task(_send_all(connection, frames, credit, sent))
@@ -192,11 +194,11 @@ async def _send_all(
 
 
 @asynccontextmanager
-async def _open(url: str) -> AsyncIterator[ClientConnection]:
+async def _open(url: str, headers: dict[str, str]) -> AsyncIterator[ClientConnection]:
     async with AsyncExitStack() as stack:
         try:
             connection = await stack.enter_async_context(
-                connect(url, compression=None, ping_timeout=120)
+                connect(url, additional_headers=headers, compression=None, ping_timeout=120)
             )
         except InvalidStatus as error:
             raise calls.error_from(refusal(error)) from None

@@ -18,11 +18,12 @@ T = TypeVar("T")
 
 
 class AsyncClient:
-    """A gateway; an asynchronous context manager."""
+    """A gateway; an asynchronous context manager. For `api_key` see `Client`."""
 
-    def __init__(self, url: str = "http://127.0.0.1:8080") -> None:
+    def __init__(self, url: str = "http://127.0.0.1:8080", api_key: str | None = None) -> None:
         self.url = url.rstrip("/")
-        self._http = httpx.AsyncClient(base_url=self.url)
+        self.headers = calls.key_headers(api_key)
+        self._http = httpx.AsyncClient(base_url=self.url, headers=self.headers)
 
     async def __aenter__(self) -> AsyncClient:
         return self

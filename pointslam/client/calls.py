@@ -5,6 +5,7 @@ The synchronous and the asynchronous client differ only in who sends it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -19,10 +20,13 @@ from shared.camera import Calibration, Intrinsics
 from shared.errors import (
     ConfigError,
     ConflictError,
+    ForbiddenError,
     InputError,
     NotFoundError,
     PointSlamError,
+    RateLimitedError,
     StorageError,
+    UnauthenticatedError,
     UnavailableError,
 )
 from shared.frames import HAS_POSE, TrackingStatus
@@ -35,8 +39,18 @@ T = TypeVar("T")
 
 _KINDS: dict[str, type[PointSlamError]] = {
     kind.code: kind
-    for kind in (ConfigError, ConflictError, NotFoundError, StorageError, UnavailableError)
+    for kind in (
+        ConfigError,
+        ConflictError,
+        ForbiddenError,
+        NotFoundError,
+        RateLimitedError,
+        StorageError,
+        UnauthenticatedError,
+        UnavailableError,
+    )
 }
+_KEY_VARIABLE = "POINTSLAM_API_KEY"
 _INPUT_CODES = (InputError.code, "too_large")
 SLOW_S = 300.0  # saving, exporting
 
@@ -91,6 +105,12 @@ def error_from(detail: ErrorDetail) -> PointSlamError:
         return InputError(detail.field, detail.reason)
     text = f"{detail.field}: {detail.reason}" if detail.field else detail.reason
     return _KINDS.get(detail.code, PointSlamError)(text)
+
+
+def key_headers(api_key: str | None) -> dict[str, str]:
+    """What every request carries: the key that was given, or that of the environment, if any."""
+    key = api_key or os.environ.get(_KEY_VARIABLE)
+    return {"Authorization": f"Bearer {key}"} if key else {}
 
 
 def path_of(session: str, rest: str = "") -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
 import httpx
@@ -19,7 +19,10 @@ _MAX_REPLY_BYTES = 1 << 20
 
 
 def stream_frames(
-    url: str, frames: Iterable[FrameMessage], credit: int | None
+    url: str,
+    frames: Iterable[FrameMessage],
+    credit: int | None,
+    headers: Mapping[str, str] | None = None,
 ) -> Iterator[FrameReply]:
     """Send frames and yield replies; without credit each frame is sent as soon as it is there.
 
@@ -27,7 +30,7 @@ def stream_frames(
         PointSlamError: the gateway refused the stream, or the connection broke.
         Exception: what `frames` raised.
     """
-    with open_stream(url) as connection:
+    with open_stream(url, headers) as connection:
         sender = _Sender(connection, frames, credit)
         sender.start()
         try:
@@ -42,7 +45,7 @@ def stream_frames(
 
 
 @contextmanager
-def open_stream(url: str) -> Iterator[ClientConnection]:
+def open_stream(url: str, headers: Mapping[str, str] | None = None) -> Iterator[ClientConnection]:
     """A connection for frames: no compression, which costs far more than it saves on images.
 
     Raises:
@@ -52,7 +55,13 @@ def open_stream(url: str) -> Iterator[ClientConnection]:
     with ExitStack() as stack:
         try:
             connection = stack.enter_context(
-                connect(url, compression=None, max_size=_MAX_REPLY_BYTES, ping_timeout=120)
+                connect(
+                    url,
+                    additional_headers=headers,
+                    compression=None,
+                    max_size=_MAX_REPLY_BYTES,
+                    ping_timeout=120,
+                )
             )
         except InvalidStatus as error:
             raise error_from(refusal(error)) from None

@@ -84,7 +84,7 @@ class Session:
         """
         url = calls.stream_url(self._client.url, self.name)
         credit = self._credit if self.mode == "offline" else None
-        for reply in stream_frames(url, frames, credit):
+        for reply in stream_frames(url, frames, credit, self._client.headers):
             self.next_seq = max(self.next_seq, reply.seq + 1)
             yield reply
 

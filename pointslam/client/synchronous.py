@@ -19,11 +19,16 @@ T = TypeVar("T")
 
 
 class Client:
-    """A gateway; a context manager. Not for use by several threads at once."""
+    """A gateway; a context manager. Not for use by several threads at once.
 
-    def __init__(self, url: str = "http://127.0.0.1:8080") -> None:
+    Without `api_key` the one in POINTSLAM_API_KEY is sent, if there is one. A certificate of an
+    authority of your own is trusted by its file in SSL_CERT_FILE.
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8080", api_key: str | None = None) -> None:
         self.url = url.rstrip("/")
-        self._http = httpx.Client(base_url=self.url)
+        self.headers = calls.key_headers(api_key)
+        self._http = httpx.Client(base_url=self.url, headers=self.headers)
 
     def __enter__(self) -> Client:
         return self

@@ -7,15 +7,20 @@ import contextlib
 import signal
 import socket
 import sys
-from argparse import Namespace
 from collections.abc import Iterator
 
 import uvicorn
+from fastapi import FastAPI
 
+from services.gateway.access.arguments import (
+    Tls,
+    add_access_arguments,
+    authority_from,
+    tls_from,
+)
 from services.gateway.app import create_app, open_sessions
 from services.gateway.config import GatewayConfig
-from services.gateway.grpc_server import serve_grpc
-from services.gateway.sessions import Sessions
+from services.gateway.grpc_server import GrpcDoor, serve_grpc
 from shared.bus import Bus, open_bus
 from shared.errors import UnavailableError
 from shared.service import (
@@ -49,15 +54,18 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--http-host", default="127.0.0.1", help="address of HTTP and gRPC")
     parser.add_argument("--http-port", type=int, default=8080)
     parser.add_argument("--grpc-port", type=int, default=50051)
+    add_access_arguments(parser)
     arguments = parser.parse_args(argv)
     limit_blas_threads()
     setup_logging(arguments.json_log)
     config = settings_from(arguments, GatewayConfig())
+    authority, tls = authority_from(arguments, config.access), tls_from(arguments)
+    door = GrpcDoor(arguments.http_host, arguments.grpc_port, authority, tls)
     listener = _listen(arguments.http_host, arguments.http_port)
     with listener, open_bus(endpoints(arguments), config.bus) as bus:
         loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
         with asyncio.Runner(loop_factory=loop_factory) as runner:
-            runner.run(_serve(bus, config, listener, arguments))
+            runner.run(_serve(bus, config, listener, door))
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -70,24 +78,24 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-async def _serve(
-    bus: Bus, config: GatewayConfig, listener: socket.socket, arguments: Namespace
-) -> None:
+async def _serve(bus: Bus, config: GatewayConfig, listener: socket.socket, door: GrpcDoor) -> None:
     sessions = open_sessions(bus, config)
-    server = _Server(_uvicorn_config(sessions, config))
+    server = _Server(_uvicorn_config(create_app(sessions, door.authority), config, door.tls))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, setattr, server, "should_exit", True)
     try:
-        async with serve_grpc(sessions, arguments.http_host, arguments.grpc_port):
+        async with serve_grpc(sessions, door):
             await server.serve([listener])
     finally:
         await sessions.close()
 
 
-def _uvicorn_config(sessions: Sessions, config: GatewayConfig) -> uvicorn.Config:
+def _uvicorn_config(app: FastAPI, config: GatewayConfig, tls: Tls | None) -> uvicorn.Config:
     return uvicorn.Config(
-        create_app(sessions),
+        app,
+        ssl_certfile=tls.certificate if tls else None,
+        ssl_keyfile=tls.key if tls else None,
         log_config=None,
         log_level="warning",
         access_log=False,

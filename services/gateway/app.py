@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 
+from services.gateway.access.authority import Authority
+from services.gateway.access.http_guard import HttpGuard
+from services.gateway.access.routes import require_table
 from services.gateway.body_limit import BodyLimit
 from services.gateway.config import GatewayConfig
 from services.gateway.dispatch import TrackerPool
@@ -15,6 +18,7 @@ from services.gateway.metrics import metrics_routes
 from services.gateway.owner import Fabric
 from services.gateway.problems import add_handlers
 from services.gateway.sessions import Sessions
+from services.gateway.ticket_http import ticket_routes
 from services.gateway.websocket import websocket_routes
 from shared.bus import Bus
 
@@ -23,7 +27,12 @@ _DESCRIPTION = """RGB-D frames in, camera poses and views of a neural-Gaussian m
 Poses are `T_map_camera`: camera to map, metres, named quaternion fields, OpenCV axes (x right,
 y down, z forward). Times are nanoseconds of the client's clock. Errors are problem documents
 (RFC 9457) with `code`, `field` and `reason`. Frames stream over the WebSocket
-`/v1/sessions/{name}/stream` as the msgpack messages that `POST .../frames` takes."""
+`/v1/sessions/{name}/stream` as the msgpack messages that `POST .../frames` takes.
+
+Send a key as `Authorization: Bearer ps_...`, made by `pointslam keys create`; it belongs to a
+tenant, whose sessions are all that it can see. A browser's sockets and event streams take
+`?ticket=` from `POST /v1/tickets` instead. 401 is no valid key, 403 a key without the scope, 429
+too much at once (see Retry-After)."""
 
 
 def open_sessions(bus: Bus, config: GatewayConfig) -> Sessions:
@@ -32,8 +41,8 @@ def open_sessions(bus: Bus, config: GatewayConfig) -> Sessions:
     return Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config))
 
 
-def create_app(sessions: Sessions) -> FastAPI:
-    """The HTTP and WebSocket side."""
+def create_app(sessions: Sessions, authority: Authority) -> FastAPI:
+    """The HTTP and WebSocket side, open to whom the authority admits."""
 
     app = FastAPI(
         title="PointSLAM++",
@@ -43,7 +52,10 @@ def create_app(sessions: Sessions) -> FastAPI:
     )
     for routes in (http_routes, map_routes, job_routes, websocket_routes):
         app.include_router(routes(sessions))
+    app.include_router(ticket_routes(authority))
     app.include_router(metrics_routes())
+    require_table(app.routes)
     add_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=sessions.fabric.config.limits.max_message_bytes)
+    app.add_middleware(HttpGuard, authority=authority)
     return app

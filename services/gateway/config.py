@@ -95,6 +95,35 @@ class StreamConfig:
 
 
 @dataclass(frozen=True)
+class JwtConfig:
+    """JSON web tokens beside our own keys; off without a file."""
+
+    key_file: str = ""  # the issuer's public key as PEM, or a JWK set
+    issuer: str = ""
+    audience: str = "pointslam"
+
+    def __post_init__(self) -> None:
+        if self.key_file and not (self.issuer and self.audience):
+            raise ConfigError("access.jwt.key_file needs access.jwt.issuer and .audience too")
+
+
+@dataclass(frozen=True)
+class AccessConfig:
+    """What one key may ask for, and from where; nothing of it holds with --insecure-local."""
+
+    requests_per_s: float = 100.0  # HTTP requests, sockets opened, RPCs
+    frames_per_s: float = 120.0  # four cameras at full rate
+    burst_s: float = 2.0  # both rates may be saved up for so long
+    ticket_s: float = 30.0  # life of a browser's ticket
+    recheck_s: float = 5.0  # a stream ends so long after its key
+    allowed_origins: tuple[str, ...] = ()  # of pages that are not the gateway's own
+    jwt: JwtConfig = field(default_factory=JwtConfig)
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "requests_per_s", "frames_per_s", "burst_s", "ticket_s", "recheck_s")
+
+
+@dataclass(frozen=True)
 class GatewayConfig:
     """All settings of the gateway."""
 
@@ -102,5 +131,6 @@ class GatewayConfig:
     dispatch: DispatchConfig = field(default_factory=DispatchConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
+    access: AccessConfig = field(default_factory=AccessConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     drain_s: float = 10.0  # time to finish what is in flight at SIGTERM

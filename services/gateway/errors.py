@@ -9,10 +9,13 @@ import grpc
 
 from shared.errors import (
     ConflictError,
+    ForbiddenError,
     InputError,
     NotFoundError,
     PointSlamError,
+    RateLimitedError,
     StorageError,
+    UnauthenticatedError,
     UnavailableError,
 )
 from shared.stream import ErrorDetail
@@ -36,6 +39,9 @@ _HTTP: tuple[tuple[type[PointSlamError], int], ...] = (
     (TooLargeError, 413),
     (OrderError, 409),
     (InputError, 422),
+    (UnauthenticatedError, 401),
+    (ForbiddenError, 403),
+    (RateLimitedError, 429),
     (NotFoundError, 404),
     (ConflictError, 409),
     (UnavailableError, 503),
@@ -46,6 +52,9 @@ _GRPC: tuple[tuple[type[PointSlamError], grpc.StatusCode], ...] = (
     (TooLargeError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (OrderError, grpc.StatusCode.FAILED_PRECONDITION),
     (InputError, grpc.StatusCode.INVALID_ARGUMENT),
+    (UnauthenticatedError, grpc.StatusCode.UNAUTHENTICATED),
+    (ForbiddenError, grpc.StatusCode.PERMISSION_DENIED),
+    (RateLimitedError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (NotFoundError, grpc.StatusCode.NOT_FOUND),
     (ConflictError, grpc.StatusCode.FAILED_PRECONDITION),
     (UnavailableError, grpc.StatusCode.UNAVAILABLE),

@@ -108,6 +108,19 @@ LOCALIZE: dict[str, Any] = {
     },
 }
 
+TICKET: dict[int | str, dict[str, Any]] = {
+    201: {
+        "content": {
+            "application/json": {
+                "example": {
+                    "ticket": "tNZ1PQjWZ2cLMH2mGVdNsX3IRsE7Lp3Dh8CXoyn6A2k",
+                    "expires_in_s": 30.0,
+                }
+            }
+        }
+    }
+}
+
 REFINE: dict[str, Any] = {
     "requestBody": {
         "required": True,

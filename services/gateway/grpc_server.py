@@ -5,12 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from services.gateway.access.arguments import Tls
+from services.gateway.access.authority import Authority
+from services.gateway.access.grpc_guard import GrpcGuard
 from services.gateway.grpc_services import (
     MapService,
     PoseService,
@@ -43,14 +47,43 @@ _NAMES = [
 ]
 
 
+@dataclass(frozen=True)
+class GrpcDoor:
+    """Where gRPC is served, to whom, and with which certificate."""
+
+    host: str
+    port: int
+    authority: Authority
+    tls: Tls | None = None
+
+    def listen(self, server: grpc.aio.Server) -> None:
+        """Add the port to the server.
+
+        Raises:
+            UnavailableError: it cannot be listened on.
+        """
+        address = f"{self.host}:{self.port}"
+        try:
+            if self.tls is None:
+                server.add_insecure_port(address)
+                return
+            pair = (self.tls.key.read_bytes(), self.tls.certificate.read_bytes())
+            server.add_secure_port(address, grpc.ssl_server_credentials([pair]))
+        except (RuntimeError, OSError) as error:
+            raise UnavailableError(f"cannot listen on {address}: {error}") from None
+
+
 @asynccontextmanager
-async def serve_grpc(sessions: Sessions, host: str, port: int) -> AsyncIterator[None]:
+async def serve_grpc(sessions: Sessions, door: GrpcDoor) -> AsyncIterator[None]:
     """Serve while the block runs; then finish the calls in flight.
 
     Raises:
         UnavailableError: the port cannot be listened on.
     """
-    server = grpc.aio.server(options=_options(sessions.fabric.config.limits.max_message_bytes))
+    server = grpc.aio.server(
+        interceptors=[GrpcGuard(door.authority)],
+        options=_options(sessions.fabric.config.limits.max_message_bytes),
+    )
     # The module exposes it by an import that type checkers take for private.
     healthy = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
     health_pb2_grpc.add_HealthServicer_to_server(healthy, server)
@@ -58,10 +91,7 @@ async def serve_grpc(sessions: Sessions, host: str, port: int) -> AsyncIterator[
     reflection.enable_server_reflection(
         [*_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME], server
     )
-    try:
-        server.add_insecure_port(f"{host}:{port}")
-    except RuntimeError as error:
-        raise UnavailableError(f"cannot listen on {host}:{port}: {error}") from None
+    door.listen(server)
     await server.start()
     readiness = asyncio.create_task(_follow_readiness(sessions, healthy))
     try:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
 
+from services.gateway.access.caller import current_caller
 from services.gateway.decode import UNKNOWN, check_frame
-from services.gateway.errors import detail, grpc_status
 from services.gateway.frame_stream import FrameStream, SlowClientError
+from services.gateway.grpc_errors import refusing
 from services.gateway.localizer import check_localize
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
@@ -30,7 +30,7 @@ from services.gateway.wire_values import (
     require,
     timed_pose_to,
 )
-from shared.errors import InputError, PointSlamError
+from shared.errors import InputError
 from shared.maps import ExportFormat, RenderRequest
 from shared.stream import FrameReply
 from shared.wire import (
@@ -71,17 +71,6 @@ _FORMATS = {
 }
 
 
-@asynccontextmanager
-async def _refusing(context: Any) -> AsyncIterator[None]:
-    """Turn an error of ours into the call's status; code and field go as trailing metadata."""
-    try:
-        yield
-    except PointSlamError as error:
-        what = detail(error)
-        metadata = (("pointslam-code", what.code), ("pointslam-field", what.field))
-        await context.abort(grpc_status(error), str(error), metadata)
-
-
 class SessionService(session_service_pb2_grpc.SessionServiceServicer):
     """Create, find, list and delete sessions."""
 
@@ -90,7 +79,7 @@ class SessionService(session_service_pb2_grpc.SessionServiceServicer):
 
     async def CreateSession(self, request: Any, context: Any) -> Any:
         """A new session."""
-        async with _refusing(context):
+        async with refusing(context):
             has_pose = request.HasField("T_map_first")
             create = CreateRequest(
                 calibration=calibration_from(require(request, "calibration")),
@@ -104,13 +93,13 @@ class SessionService(session_service_pb2_grpc.SessionServiceServicer):
 
     async def GetSession(self, request: Any, context: Any) -> Any:
         """One session's state."""
-        async with _refusing(context):
+        async with refusing(context):
             session = await self._sessions.get(request.session_id)
             return session_service_pb2.GetSessionResponse(session=await self._state(session))
 
     async def ListSessions(self, request: Any, context: Any) -> Any:
         """All sessions."""
-        async with _refusing(context):
+        async with refusing(context):
             rows = [
                 session_service_pb2.Session(
                     session_id=row["session"],
@@ -127,7 +116,7 @@ class SessionService(session_service_pb2_grpc.SessionServiceServicer):
 
     async def DeleteSession(self, request: Any, context: Any) -> Any:
         """Remove a session."""
-        async with _refusing(context):
+        async with refusing(context):
             await self._sessions.delete(request.session_id)
             return session_service_pb2.DeleteSessionResponse()
 
@@ -154,7 +143,7 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
 
     async def TrackFrames(self, request_iterator: Any, context: Any) -> None:
         """Answer a stream of frames in order."""
-        async with _refusing(context):
+        async with refusing(context):
             requests = aiter(request_iterator)
             try:
                 first = await anext(requests)
@@ -181,7 +170,7 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
 
     async def Localize(self, request: Any, context: Any) -> Any:
         """Find one image in a session's map."""
-        async with _refusing(context):
+        async with refusing(context):
             session = await self._sessions.get(request.session_id)
             message = localize_from(request)
             check_localize(message, session.calibration)
@@ -189,6 +178,7 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
 
 
 def _frame(request: Any, session: Session) -> Any:
+    current_caller().budget.take_frame()
     if request.session_id not in ("", session.name):
         raise InputError("session_id", f"this stream is of session {session.name}")
     message = frame_from(require(request, "frame"))
@@ -210,19 +200,19 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
 
     async def GetPose(self, request: Any, context: Any) -> Any:
         """The newest pose."""
-        async with _refusing(context):
+        async with refusing(context):
             pose = (await self._sessions.get(request.session_id)).pose()
             return pose_service_pb2.GetPoseResponse(pose=timed_pose_to(pose))
 
     async def GetPoseAt(self, request: Any, context: Any) -> Any:
         """The pose at a time."""
-        async with _refusing(context):
+        async with refusing(context):
             pose = (await self._sessions.get(request.session_id)).pose(request.t_ns)
             return pose_service_pb2.GetPoseAtResponse(pose=timed_pose_to(pose))
 
     async def WatchPoses(self, request: Any, context: Any) -> AsyncIterator[Any]:
         """Each new pose, until the client has enough."""
-        async with _refusing(context):
+        async with refusing(context):
             session = await self._sessions.get(request.session_id)
             poses = session.watch()
             try:
@@ -242,7 +232,7 @@ class MapService(map_service_pb2_grpc.MapServiceServicer):
 
     async def GetMapInfo(self, request: Any, context: Any) -> Any:
         """State of the map."""
-        async with _refusing(context):
+        async with refusing(context):
             info = await self._sessions.info(await self._sessions.get(request.session_id))
             fields = map_service_pb2.GetMapInfoResponse.DESCRIPTOR.fields_by_name
             values = {name: info[name] for name in fields if name != "session_id"}
@@ -250,7 +240,7 @@ class MapService(map_service_pb2_grpc.MapServiceServicer):
 
     async def RenderView(self, request: Any, context: Any) -> Any:
         """A view as an image."""
-        async with _refusing(context):
+        async with refusing(context):
             session = await self._sessions.get(request.session_id)
             view = _view(request, session)
             view.check(self._sessions.fabric.config.limits.max_render_pixels)
@@ -265,7 +255,7 @@ class MapService(map_service_pb2_grpc.MapServiceServicer):
 
     async def ExportMap(self, request: Any, context: Any) -> AsyncIterator[Any]:
         """The map as a file, in pieces."""
-        async with _refusing(context):
+        async with refusing(context):
             session = await self._sessions.get(request.session_id)
             format = chosen(request.format, _FORMATS, "format")
             async for piece in export_pieces(session, format, self._sessions.fabric.config):

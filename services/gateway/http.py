@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import JSONResponse, Response
 
 from services.gateway import examples
+from services.gateway.access.caller import current_caller
 from services.gateway.decode import plain, read_frame
 from services.gateway.errors import MESSAGE
 from services.gateway.localizer import read_localize
@@ -59,6 +60,7 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
     async def post_frame(name: str, request: Request) -> Response:
         """Track one frame: a msgpack FrameMessage in, a FrameReply out (JSON if accepted)."""
         session = await sessions.get(name)
+        current_caller().budget.take_frame()
         message = read_frame(await request.body(), session.calibration)
         return _reply(request, await session.track(message))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
@@ -9,7 +11,14 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
 from services.gateway.errors import detail, http_status, problem
-from shared.errors import InputError, NotFoundError, PointSlamError, UnavailableError
+from shared.errors import (
+    InputError,
+    NotFoundError,
+    PointSlamError,
+    RateLimitedError,
+    UnauthenticatedError,
+    UnavailableError,
+)
 from shared.stream import ErrorDetail
 
 MEDIA_TYPE = "application/problem+json"
@@ -19,8 +28,15 @@ _RETRY_AFTER_S = "1"
 def problem_response(error: PointSlamError) -> Response:
     """The response to a request that failed with one of our errors."""
     status = http_status(error)
-    headers = {"Retry-After": _RETRY_AFTER_S} if isinstance(error, UnavailableError) else None
-    return JSONResponse(problem(status, detail(error)), status, headers, MEDIA_TYPE)
+    return JSONResponse(problem(status, detail(error)), status, _headers(error), MEDIA_TYPE)
+
+
+def _headers(error: PointSlamError) -> dict[str, str]:
+    if isinstance(error, UnauthenticatedError):
+        return {"WWW-Authenticate": "Bearer"}
+    if isinstance(error, RateLimitedError):
+        return {"Retry-After": str(math.ceil(error.retry_after_s))}
+    return {"Retry-After": _RETRY_AFTER_S} if isinstance(error, UnavailableError) else {}
 
 
 def add_handlers(app: FastAPI) -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import time
 from typing import Any
 
+from services.gateway.access.tenants import public_name
 from services.gateway.delivery import Delivery
 from services.gateway.dispatch import Limits
 from services.gateway.errors import detail
@@ -27,7 +28,7 @@ class Session:
     """A session that this gateway serves; owned by the event loop."""
 
     def __init__(self, fabric: Fabric, opened: OpenReply) -> None:
-        self.name = opened.session
+        self.name = public_name(opened.session)
         self.calibration = opened.calibration
         self.created_ns = opened.created_ns
         self.is_live = opened.mode == "live"
@@ -123,7 +124,7 @@ class Session:
         self._frames.close()
         self._delivery.close()
         self.owner.close()
-        self._fabric.trackers.release(self.name)
+        self._fabric.trackers.release(self.owner.session)
 
     async def _answer(self, message: FrameMessage, waited_ms: float) -> FrameReply:
         start = time.perf_counter()
@@ -158,7 +159,7 @@ class Session:
             # It would cover what a keyframe that trackers cannot see yet covers already.
             frame = dataclasses.replace(frame, may_be_keyframe=False)
         return TrackRequest(
-            session=self.name,
+            session=self.owner.session,
             epoch=self.owner.epoch,
             map_revision=self.map_revision,
             calibration=self.calibration,

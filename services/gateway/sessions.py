@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import time
 import uuid
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from services.gateway.access.tenants import SESSION_NAME, full_name, is_callers, public_name
 from services.gateway.decode import matrix_of
 from services.gateway.dispatch import choose
 from services.gateway.owner import Fabric, open_existing, open_new
@@ -31,7 +31,6 @@ from shared.se3 import Pose
 from shared.tracks import OpenReply, OpenRequest
 
 MODES = ("live", "offline")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _MAX_SEED = 1 << 31
 
 
@@ -48,7 +47,7 @@ class CreateRequest:
     def check(self) -> None:
         """Refuse what cannot be used with an InputError that names the field."""
         self.calibration.check()
-        if self.name is not None and not _NAME.fullmatch(self.name):
+        if self.name is not None and not SESSION_NAME.fullmatch(self.name):
             raise InputError("name", "must be 1 to 64 letters, digits, '-' or '_'")
         if self.mode not in MODES:
             raise InputError("mode", f"must be one of {', '.join(MODES)}, got {self.mode[:40]!r}")
@@ -64,7 +63,10 @@ class CreateRequest:
 
 @dataclass
 class Sessions:
-    """Sessions by name; those of another time are found on the mappers' disks."""
+    """Sessions by full name; those of another time are found on the mappers' disks.
+
+    Callers give and see their tenant's own names: sessions of others do not exist for them.
+    """
 
     fabric: Fabric
     _open: dict[str, Session] = field(default_factory=dict)
@@ -80,7 +82,7 @@ class Sessions:
             UnavailableError: no mapper takes it.
         """
         request.check()
-        name = request.name or uuid.uuid4().hex
+        name = full_name(request.name or uuid.uuid4().hex)
         open_request = OpenRequest(
             session=name,
             mode=request.mode,
@@ -90,7 +92,7 @@ class Sessions:
         )
         async with self._lock_of(name):
             if name in self._open or await self._mapper_of(name) is not None:
-                raise ConflictError(f"session {name} exists")
+                raise ConflictError(f"session {public_name(name)} exists")
             opened = await open_new(self.fabric, open_request, self._mappers_for(name))
             self._open[name] = session = Session(self.fabric, opened)
         return session
@@ -102,6 +104,7 @@ class Sessions:
             NotFoundError: there is no such session.
             UnavailableError: no mapper could take it up in time.
         """
+        name = full_name(name)
         if name in self._open:
             return self._open[name]
         async with self._lock_of(name):
@@ -110,13 +113,13 @@ class Sessions:
         return self._open[name]
 
     async def list(self) -> list[dict[str, Any]]:
-        """Every session on the live mappers, newest first."""
+        """Every session of the caller's tenant on the live mappers, newest first."""
         found: dict[str, dict[str, Any]] = {}
         for mapper in sorted(self.fabric.mappers.names):
             for summary in (await self._list_of(mapper)).sessions:
-                row = codec.to_json(summary) | {"mapper": mapper}
-                if summary.session not in found or summary.is_open:
-                    found[summary.session] = row
+                name = public_name(summary.session)
+                if is_callers(summary.session) and (name not in found or summary.is_open):
+                    found[name] = codec.to_json(summary) | {"session": name, "mapper": mapper}
         return sorted(found.values(), key=lambda row: -row["created_ns"])
 
     async def delete(self, name: str) -> None:
@@ -125,10 +128,11 @@ class Sessions:
         Raises:
             NotFoundError: there is no such session.
         """
+        name = full_name(name)
         session = self._open.get(name)
         mapper = session.owner.mapper if session else await self._mapper_of(name)
         if mapper is None:
-            raise NotFoundError(f"no session {name[:64]!r}")
+            raise NotFoundError(f"no session {public_name(name)!r}")
         timeout_s = self.fabric.config.mapping.question_timeout_s
         key = Keys.mapper(mapper, "delete")
         await self.fabric.bus.ask(key, DeleteRequest(name), Empty, timeout_s)
@@ -140,7 +144,8 @@ class Sessions:
         timeout_s = self.fabric.config.mapping.question_timeout_s
         info: MapInfo = await session.owner.ask("info", Empty(), MapInfo, timeout_s)
         tracking = session.state() | {"credit": self.fabric.config.stream.credit}
-        return codec.to_json(info) | {"created_ns": session.created_ns, "tracking": tracking}
+        own = {"session": session.name, "created_ns": session.created_ns, "tracking": tracking}
+        return codec.to_json(info) | own
 
     def is_ready(self) -> bool:
         """Whether a new session could be created and tracked."""
@@ -169,7 +174,7 @@ class Sessions:
         while True:
             mapper = await self._mapper_of(name)
             if mapper is None:
-                raise NotFoundError(f"no session {name[:64]!r}")
+                raise NotFoundError(f"no session {public_name(name)!r}")
             try:
                 return await open_existing(self.fabric, name, mapper)
             except UnavailableError:

@@ -7,6 +7,7 @@ import asyncio
 from fastapi import APIRouter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from services.gateway.access.caller import current_caller
 from services.gateway.decode import read_frame, read_numbers
 from services.gateway.errors import MESSAGE
 from services.gateway.frame_stream import FrameStream, SlowClientError
@@ -58,6 +59,7 @@ async def _serve(websocket: WebSocket, session: Session, sessions: Sessions) -> 
 
 
 def _frame(data: bytes | None, session: Session) -> FrameMessage:
+    current_caller().budget.take_frame()
     if data is None:
         raise InputError(MESSAGE, "must be a binary message")
     return read_frame(data, session.calibration)

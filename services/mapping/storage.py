@@ -18,7 +18,7 @@ from shared import codec
 from shared.camera import Calibration
 from shared.errors import InputError, NotFoundError, StorageError
 
-_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,127}")  # a tenant's name before the session's
 _RECORD = "session.msgpack"
 
 
@@ -43,7 +43,7 @@ def check_session_name(name: str) -> None:
         InputError: says what a name may be.
     """
     if not _NAME.fullmatch(name):
-        allowed = "1 to 64 of letters, digits, '_', '.', '-', not starting with '.'"
+        allowed = "1 to 128 of letters, digits, '_', '.', '-', not starting with '.'"
         raise InputError("session", f"must be {allowed}, got {name[:80]!r}")
 
 

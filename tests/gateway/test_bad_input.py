@@ -298,7 +298,7 @@ def raw_connection(gateway):
 def test_a_client_that_disconnects_in_the_middle_of_a_post_hurts_nobody(gateway, offline, good):
     data = codec.pack(good)
     with raw_connection(gateway) as connection:
-        head = f"POST /v1/sessions/{offline.name}/frames HTTP/1.1\r\nHost: x\r\n"
+        head = f"POST /v1/sessions/{offline.name}/frames HTTP/1.1\r\nHost: localhost\r\n"
         connection.sendall(head.encode() + f"Content-Length: {len(data)}\r\n\r\n".encode())
         connection.sendall(data[:100])
 
@@ -335,7 +335,7 @@ def _read_to_the_end(connection):
 def test_a_client_that_never_reads_is_cut_off_and_the_session_goes_on(gateway, offline, good):
     url = f"{gateway.url.replace('http', 'ws')}/v1/sessions/{offline.name}/stream"
     request = (
-        f"GET {urlsplit(url).path} HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\n"
+        f"GET {urlsplit(url).path} HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
         "Connection: Upgrade\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
         "Sec-WebSocket-Version: 13\r\n\r\n"
     )

@@ -1,0 +1,92 @@
+"""Before every gRPC method: who it is, and whether they may."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import grpc
+
+from services.gateway.access import audit
+from services.gateway.access.authority import Authority, Shown
+from services.gateway.access.caller import CALLER, Caller
+from services.gateway.access.routes import ADMIN, ANY, GRPC, OPEN, Access
+from services.gateway.grpc_errors import refusing
+from shared.errors import PointSlamError
+
+_Continue = Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler | None]]
+
+
+class GrpcGuard(grpc.aio.ServerInterceptor):
+    """Lets no call through that the authority does not admit."""
+
+    def __init__(self, authority: Authority) -> None:
+        self._authority = authority
+
+    async def intercept_service(
+        self, continuation: _Continue, handler_call_details: grpc.HandlerCallDetails
+    ) -> Any:
+        """The method's handler, with the question who calls before it."""
+        handler = await continuation(handler_call_details)
+        access = GRPC.get(handler_call_details.method, ANY)
+        if handler is None or access == OPEN:
+            return handler
+        metadata = dict(handler_call_details.invocation_metadata or ())
+        shown = Shown(str(metadata.get("authorization", "")))
+        return _Guarded(self._authority, access, handler_call_details.method, shown).around(handler)
+
+
+class _Guarded:
+    """One call of one method."""
+
+    def __init__(self, authority: Authority, access: Access, method: str, shown: Shown) -> None:
+        self._authority = authority
+        self._access = access
+        self._method = method
+        self._shown = shown
+
+    def around(self, handler: Any) -> grpc.RpcMethodHandler:
+        """A handler of the same kind."""
+        if handler.request_streaming:
+            make, behaviour = grpc.stream_stream_rpc_method_handler, handler.stream_stream
+        elif handler.response_streaming:
+            make, behaviour = grpc.unary_stream_rpc_method_handler, handler.unary_stream
+        else:
+            make, behaviour = grpc.unary_unary_rpc_method_handler, handler.unary_unary
+        guard = self._stream if inspect.isasyncgenfunction(behaviour) else self._call
+        return make(guard(behaviour), handler.request_deserializer, handler.response_serializer)
+
+    def _call(self, behaviour: Any) -> Callable[[Any, Any], Awaitable[Any]]:
+        async def call(request: Any, context: Any) -> Any:
+            caller = await self._admit(context)
+            outcome = "OK"
+            try:
+                return await behaviour(request, context)
+            except BaseException:
+                outcome = str(context.code())
+                raise
+            finally:
+                if self._access == ADMIN:
+                    audit.acted(caller, self._method, context.peer(), outcome)
+
+        return call
+
+    def _stream(self, behaviour: Any) -> Callable[[Any, Any], AsyncIterator[Any]]:
+        async def stream(request: Any, context: Any) -> AsyncIterator[Any]:
+            await self._admit(context)
+            async for response in behaviour(request, context):
+                yield response
+
+        return stream
+
+    async def _admit(self, context: Any) -> Caller:
+        """Set the caller for what the method does; the call's task ends with it."""
+        async with refusing(context):
+            try:
+                caller = self._authority.admit(self._shown, self._access)
+            except PointSlamError as error:
+                audit.refused(error, self._method, context.peer(), self._shown.authorization)
+                raise
+        CALLER.set(caller)
+        return caller
