@@ -7,14 +7,13 @@ direction, fitted to what the networks say of the directions that keyframes saw 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from services.mapping.config import ExportConfig
 from services.mapping.decoders import decoder_for
 from services.mapping.harmonics import LeastSquares, basis
 from services.mapping.pipeline import Mapper
@@ -28,7 +27,7 @@ MIN_OPACITY = 1.0 / 255.0
 _RIDGE = 0.01  # of `LeastSquares`
 _MAX_SIGHTS = 24  # of one anchor that are fitted to
 _MIN_WEIGHT = 1e-3  # a sight whose depth does not agree still says something where none does
-_BLOCK = 1 << 15  # anchors at once; bounds the memory of their normal equations
+_BLOCK = 1 << 14  # anchors at once; bounds the memory of their normal equations
 
 
 @dataclass(frozen=True)
@@ -69,26 +68,24 @@ class BakedGaussians:
         return replace(self.gaussians, colours=(values + 0.5).clamp_min(0.0))
 
 
-@torch.no_grad()
-def bake(copy: MapCopy, config: ExportConfig) -> BakedGaussians:
-    """All Gaussians of a map that show."""
-    total, children = len(copy.painter.anchors), copy.painter.anchors.config.children
-    parts, harmonics = [], []
+def bake(copy: MapCopy, degree: int) -> Iterator[BakedGaussians]:
+    """All Gaussians of a map that show, a block of anchors at a time; harmonics up to `degree`."""
+    total = len(copy.painter.anchors)
     for block in torch.arange(total, device=copy.painter.anchors.device).split(_BLOCK):
-        if len(block) == 0:
-            continue
-        made = _as_made(copy, block)
-        fitted = _fitted(copy, block, made.colours.view(len(block), -1), config.harmonics_degree)
-        fitted = fitted.view(len(block), -1, children, 3).transpose(1, 2).flatten(0, 1)
-        shows = made.opacities > MIN_OPACITY
-        parts.append([tensor[shows] for tensor in made.tensors()])
-        harmonics.append(fitted[shows])
-    if not parts:
-        nothing = (torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (3,)))
-        size = (config.harmonics_degree + 1) ** 2
-        return BakedGaussians(Gaussians(*nothing), torch.zeros(0, size, 3))
-    columns = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
-    return BakedGaussians(Gaussians(*columns), torch.cat(harmonics))
+        if len(block) > 0:
+            yield _baked(copy, block, degree)
+
+
+@torch.no_grad()
+def _baked(copy: MapCopy, block: Tensor, degree: int) -> BakedGaussians:
+    """The Gaussians of anchors that show."""
+    made, children = _as_made(copy, block), copy.painter.anchors.config.children
+    fitted = _fitted(copy, block, made.colours.view(len(block), -1), degree)
+    harmonics = fitted.view(len(block), -1, children, 3).transpose(1, 2).flatten(0, 1)
+    shows = made.opacities > MIN_OPACITY
+    return BakedGaussians(
+        Gaussians(*(tensor[shows] for tensor in made.tensors())), harmonics[shows]
+    )
 
 
 def _as_made(copy: MapCopy, block: Tensor) -> Gaussians:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tarfile
 import tempfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,15 +17,49 @@ from services.mapping.storage import storage_errors
 
 _PACKED = (".msgpack", ".bin")
 _FIRST = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+_COUNT_DIGITS = 20  # a count has at most
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
-def ply_bytes(baked: BakedGaussians) -> bytes:
-    """Gaussians in the binary PLY that splat viewers read.
+def write_ply(file: BinaryIO, blocks: Iterable[BakedGaussians], degree: int) -> None:
+    """Gaussians in the binary PLY that splat viewers read, block by block: a map has gigabytes.
 
     Opacity as a logit, scales as logarithms, quaternions wxyz, coefficients of one colour after
     those of another.
+
+    Args:
+        file: at its start; its beginning is written again when the number of Gaussians is known.
+        blocks: parts of the map.
+        degree: of their harmonics.
     """
+    count = 0
+    file.write(_ply_header(count, degree))
+    for block in blocks:
+        vertices = _ply_vertices(block)
+        file.write(vertices.tobytes())
+        count += len(vertices)
+    file.seek(0)
+    file.write(_ply_header(count, degree))
+
+
+def _ply_header(count: int, degree: int) -> bytes:
+    """As long for any count."""
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    number = str(count)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {'-' * (_COUNT_DIGITS - len(number))}",
+        f"element vertex {number}",
+        *(f"property float {name}" for name in (*_FIRST, *rest, *_LAST)),
+        "end_header",
+        "",
+    ]
+    return "\n".join(header).encode()
+
+
+def _ply_vertices(baked: BakedGaussians) -> NDArray[np.float32]:
+    """One row a Gaussian, in the order of the header."""
     means, scales, quats, opacities, _ = (
         tensor.detach().cpu().numpy() for tensor in baked.gaussians.tensors()
     )
@@ -39,11 +74,7 @@ def ply_bytes(baked: BakedGaussians) -> bytes:
         np.log(scales.clip(1e-9)),
         quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-12),
     ]
-    rest = [f"f_rest_{i}" for i in range(3 * (harmonics.shape[1] - 1))]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
-    header += [f"property float {name}" for name in (*_FIRST, *rest, *_LAST)]
-    text = "\n".join([*header, "end_header", ""])
-    return text.encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
+    return np.concatenate(columns, axis=1).astype("<f4", copy=False)
 
 
 def pack_folder(session: Path) -> BinaryIO:
@@ -65,15 +96,15 @@ def pack_folder(session: Path) -> BinaryIO:
     return file
 
 
-def spooled(content: bytes, session: Path) -> BinaryIO:
-    """Bytes in a file without a name in the session's folder.
+def spooled(write: Callable[[BinaryIO], object], session: Path) -> BinaryIO:
+    """A file without a name in the session's folder, with what `write` puts into it.
 
     Raises:
         StorageError: the disk refused.
     """
     with storage_errors(str(session)):
         file = _nameless(session)
-        file.write(content)
+        write(file)
     return file
 
 

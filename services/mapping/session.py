@@ -13,7 +13,7 @@ import torch
 
 from services.mapping.baking import MapCopy, bake
 from services.mapping.config import MappingConfig
-from services.mapping.export import pack_folder, ply_bytes, spooled
+from services.mapping.export import pack_folder, spooled, write_ply
 from services.mapping.exports import Exports
 from services.mapping.figures import MapFigures
 from services.mapping.ledger import Ledger, Resumed
@@ -168,9 +168,11 @@ class Session:
             with self._saving:
                 return pack_folder(path)
         if format is ExportFormat.MESH:
-            return spooled(export_mesh(self._worker.visit), path)
-        copied = self._worker.visit(MapCopy.of)
-        return spooled(ply_bytes(bake(copied, self._surroundings.config.export)), path)
+            mesh = export_mesh(self._worker.visit)
+            return spooled(lambda file: file.write(mesh), path)
+        degree = self._surroundings.config.export.harmonics_degree
+        blocks = bake(self._worker.visit(MapCopy.of), degree)
+        return spooled(lambda file: write_ply(file, blocks, degree), path)
 
     @property
     def refinement(self) -> JobStatus:

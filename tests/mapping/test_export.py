@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from services.mapping.baking import BakedGaussians
-from services.mapping.export import ply_bytes
+from services.mapping.export import write_ply
 from services.mapping.exports import MAX_OPEN, Exports
 from services.mapping.rasterizer import Gaussians
 from shared.errors import NotFoundError
@@ -28,6 +28,11 @@ def baked(count: int = 4, degree: int = 0) -> BakedGaussians:
     return BakedGaussians(gaussians, harmonics)
 
 
+def ply_bytes(*blocks: BakedGaussians, degree: int = 0) -> bytes:
+    write_ply(file := io.BytesIO(), blocks, degree)
+    return file.getvalue()
+
+
 def read_ply(data: bytes) -> np.ndarray:
     """The vertices of a binary PLY, by the names in its own header."""
     header, _, body = data.partition(b"end_header\n")
@@ -41,7 +46,7 @@ def read_ply(data: bytes) -> np.ndarray:
 
 @pytest.mark.parametrize(("degree", "rest"), [(0, 0), (1, 9), (2, 24), (3, 45)])
 def test_a_ply_holds_what_3dgs_viewers_expect(degree, rest):
-    vertices = read_ply(ply_bytes(baked(degree=degree)))
+    vertices = read_ply(ply_bytes(baked(degree=degree), degree=degree))
 
     assert vertices.dtype.names == (
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -69,7 +74,7 @@ def test_a_viewer_computes_the_colours_of_a_direction_from_the_ply():
     expected = baked(degree=1)
     camera = expected.gaussians.means[2] - 3.0 * torch.from_numpy(direction).float()
 
-    vertex = read_ply(ply_bytes(expected))[2]
+    vertex = read_ply(ply_bytes(expected, degree=1))[2]
 
     # As the viewers' shaders spell it: a constant, then three functions, colour by colour.
     colour = [
@@ -85,6 +90,15 @@ def test_a_viewer_computes_the_colours_of_a_direction_from_the_ply():
 
 def columns(vertices: np.ndarray, *names: str) -> np.ndarray:
     return np.stack([vertices[name] for name in names], axis=1)
+
+
+def test_blocks_of_a_map_follow_each_other_in_one_ply():
+    first, second = baked(12), baked(3)
+
+    vertices = read_ply(ply_bytes(first, second))
+
+    means = torch.cat([first.gaussians.means, second.gaussians.means])
+    np.testing.assert_allclose(columns(vertices, "x", "y", "z"), means)
 
 
 def test_a_map_of_nothing_is_a_ply_without_vertices():

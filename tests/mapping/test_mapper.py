@@ -9,17 +9,16 @@ import pytest
 import torch
 
 from services.mapping import densification
-from services.mapping.baking import MapCopy, bake
+from services.mapping.baking import BakedGaussians, MapCopy, bake
 from services.mapping.config import (
     AnchorConfig,
     DensificationConfig,
-    ExportConfig,
     MappingConfig,
     ScheduleConfig,
 )
 from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
-from services.mapping.rasterizer import View
+from services.mapping.rasterizer import Gaussians, View
 from shared import se3
 from shared.errors import InputError
 from shared.maps import RenderRequest
@@ -276,11 +275,17 @@ def test_a_keyframe_whose_image_is_damaged_is_refused_and_not_trained_on(
     assert mapper.views.seqs() == [0]
 
 
+def baked_whole(copy: MapCopy, degree: int = 3) -> BakedGaussians:
+    blocks = list(bake(copy, degree))
+    columns = (torch.cat(c) for c in zip(*(b.gaussians.tensors() for b in blocks), strict=True))
+    return BakedGaussians(Gaussians(*columns), torch.cat([b.harmonics for b in blocks]))
+
+
 def test_a_baked_map_holds_only_gaussians_that_show(mapper, insert):
     insert(mapper, 0)
     mapper.iterate(10)
 
-    found = bake(MapCopy.of(mapper), ExportConfig())
+    found = baked_whole(MapCopy.of(mapper))
 
     assert 0 < len(found.gaussians.means) <= 5 * len(mapper.anchors)
     assert found.gaussians.opacities.min() > 1 / 255
@@ -288,17 +293,17 @@ def test_a_baked_map_holds_only_gaussians_that_show(mapper, insert):
 
 
 def test_a_map_without_keyframes_bakes_to_nothing(mapper):
-    assert len(bake(MapCopy.of(mapper), ExportConfig()).gaussians.means) == 0
+    assert list(bake(MapCopy.of(mapper), degree=3)) == []
 
 
 def test_a_copy_for_baking_is_not_touched_by_the_optimisation(mapper, insert):
     insert(mapper, 0)
     mapper.iterate(5)
-    before = bake(copy := MapCopy.of(mapper), ExportConfig())
+    before = baked_whole(copy := MapCopy.of(mapper))
 
     mapper.iterate(5)
 
-    assert torch.equal(before.harmonics, bake(copy, ExportConfig()).harmonics)
+    assert torch.equal(before.harmonics, baked_whole(copy).harmonics)
 
 
 def test_baked_harmonics_come_nearer_to_the_map_than_a_single_colour(
@@ -316,7 +321,7 @@ def test_baked_harmonics_come_nearer_to_the_map_than_a_single_colour(
     copy, camera = MapCopy.of(mapper), torch.from_numpy(true_pose(6)[:3, 3]).float()
 
     def error(degree: int) -> float:
-        seen = bake(copy, ExportConfig(harmonics_degree=degree)).seen_from(camera)
+        seen = baked_whole(copy, degree).seen_from(camera)
         return float((mapper.painter.rasterizer(seen, view).colour - expected).square().mean())
 
     assert error(3) < 0.8 * error(0)
@@ -328,9 +333,9 @@ def test_a_keyframe_that_sees_none_of_the_map_does_not_hinder_baking(mapper, ins
     (view,) = copy.views
     away = replace(view, T_world_camera=se3.exp([0, 0, 0, 0, np.pi, 0]))
 
-    baked = bake(replace(copy, views=[view, away]), ExportConfig())
+    baked = baked_whole(replace(copy, views=[view, away]))
 
-    assert torch.equal(baked.harmonics, bake(copy, ExportConfig()).harmonics)
+    assert torch.equal(baked.harmonics, baked_whole(copy).harmonics)
 
 
 def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose):
