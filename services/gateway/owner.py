@@ -92,6 +92,8 @@ class MapOwner:
                     Keys.session(self.session, epoch, question), message, kind, timeout_s
                 )
             except GoneError:
+                if time.monotonic() > deadline:  # there, but unsure of its lease all the time
+                    raise
                 await self.reopen(epoch, deadline)
             except TimedOutError:
                 if self.mapper in self._fabric.mappers.names:
