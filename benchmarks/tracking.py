@@ -1,5 +1,8 @@
 """Tracking alone, in process, over sequence folders, beside itself with less and its peers.
 
+Times are a worker's on a map whose owner has the next neighbourhood ready: from the frame in hand
+to the answer, with the waiting for what is fetched, unpacked and derived beside.
+
 python -m benchmarks.tracking SEQUENCE... [--frames N] [--stride N] [--json FILE] [--alone]
 """
 
@@ -22,7 +25,7 @@ from shared.config import override, read_overrides
 
 _HEADER = (
     "sequence / variant / peer   frames lost coarse reloc  kfs ateOnl.cm ateFin.cm  "
-    "rpe1mm  rpe1d rpe30mm rpe30d   ms50   ms95"
+    "rpe1mm  rpe1d rpe30mm rpe30d   ms50   ms95  last/first"
 )
 
 
@@ -31,7 +34,7 @@ def _print_row(row: Row, indent: str = "") -> None:
         f"{indent + row.sequence:27} {row.frames:6d} {row.lost:4d} {row.coarse_only:6d} "
         f"{row.relocalised:5d} {row.keyframes:4d} {row.ate_online_cm:9.3f} {row.ate_final_cm:9.3f} "
         f"{row.rpe1_mm:7.2f} {row.rpe1_deg:6.3f} {row.rpe30_mm:7.2f} {row.rpe30_deg:6.3f} "
-        f"{row.total_ms_median:6.1f} {row.total_ms_p95:6.1f}",
+        f"{row.total_ms_median:6.1f} {row.total_ms_p95:6.1f} {row.last_to_first:11.2f}",
         flush=True,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,8 +14,10 @@ from benchmarks.cold_worker import ColdWorker, cold_worker
 from services.gateway.prior import next_prior
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
 from services.tracking.config import TrackingConfig
+from services.tracking.executors import NoHelper
 from services.tracking.local_map import LocalMap, derive
 from services.tracking.pipeline import track
+from shared import codec
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import (
     HAS_POSE,
@@ -29,9 +31,11 @@ from shared.frames import (
     TrackRequest,
 )
 from shared.se3 import angle_rad, from_quat_xyzw, inverse
-from shared.tracks import Candidates, CandidatesRequest, TrackResult
+from shared.tracks import Candidates, CandidatesRequest, TrackingContext, TrackResult
 
 Poses = NDArray[np.float64]  # [F, 4, 4]
+_Key = tuple[int, int]  # revision, seq of the reference
+_SPAN = 100  # frames whose times are compared
 
 
 class Folder:
@@ -72,21 +76,40 @@ def _lines(path: Path) -> list[str]:
 
 
 class StoreSource:
-    """A map in this process as tracking asks for it."""
+    """A map in this process as a worker has it: unpacked and derived while a frame is decoded."""
 
-    def __init__(self, store: KeyframeStore, config: TrackingConfig) -> None:
+    def __init__(
+        self, store: KeyframeStore, config: TrackingConfig, fetching: Executor | None = None
+    ) -> None:
         self._store = store
         self._config = config
-        self._key = (-1, -1)
-        self._local: LocalMap | None = None
+        self._fetching = fetching or NoHelper()
+        self._built: tuple[_Key, bytes] | None = None
+        self._fetched: tuple[_Key, Future[LocalMap]] | None = None
+
+    def build_ahead(self, seq: int) -> None:
+        """What the map's owner does as soon as it has a keyframe."""
+        self._built = (self._key(seq), codec.pack(self._store.context(seq)))
+
+    def fetch_ahead(self, reference_seq: int) -> Future[LocalMap]:
+        """What a worker does as soon as it has a frame; the last neighbourhood is kept."""
+        key = self._key(reference_seq)
+        if self._fetched is None or self._fetched[0] != key:
+            self._fetched = (key, self._fetching.submit(self._fetch, reference_seq))
+        return self._fetched[1]
+
+    def _key(self, seq: int) -> _Key:
+        return self._store.revision, seq
+
+    def _fetch(self, seq: int) -> LocalMap:
+        if self._built is None or self._built[0] != self._key(seq):
+            self.build_ahead(seq)
+        assert self._built is not None
+        return derive(codec.unpack(TrackingContext, self._built[1]), self._config.registration)
 
     def local_map(self, reference_seq: int) -> LocalMap:
-        """The neighbourhood of a keyframe; the last one is kept."""
-        key = (self._store.revision, reference_seq)
-        if self._local is None or key != self._key:
-            context = self._store.context(reference_seq)
-            self._key, self._local = key, derive(context, self._config.registration)
-        return self._local
+        """The neighbourhood of a keyframe."""
+        return self.fetch_ahead(reference_seq).result()
 
     def loop_map(self, seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, of what is near to it in the graph only."""
@@ -115,6 +138,7 @@ class Row:
     rpe30_deg: float
     total_ms_median: float
     total_ms_p95: float
+    last_to_first: float  # median time of the last hundred frames beside that of the first
     stages_ms_median: dict[str, float] = field(default_factory=dict)
     stages_ms_p95: dict[str, float] = field(default_factory=dict)
     cold_worker: ColdWorker | None = None
@@ -129,15 +153,17 @@ def run(
 ) -> Row:
     """Track the frames in order, as the gateway and the map's owner would let it happen."""
     store = KeyframeStore(keyframes)
-    source = StoreSource(store, config)
     prior: Prior | None = None
     results: list[TrackResult] = []
-    with ThreadPoolExecutor(1) as helper:  # as a worker has
+    with ThreadPoolExecutor(1) as helper, ThreadPoolExecutor(1) as fetching:  # as a worker has
+        source = StoreSource(store, config, fetching)
         for index in indices:
             request = _request(folder, index, prior, store.revision)
+            source.fetch_ahead(prior.reference_seq if prior else -1)
             result = track(request, source, config, helper)
             if result.keyframe is not None:
                 store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
+                source.build_ahead(index)
             prior = next_prior(prior, request.frame, result)
             results.append(result)
     truth = np.stack([folder.true_pose(index) for index in indices])
@@ -188,6 +214,7 @@ def _row(
         rpe30_deg=rpe30[1],
         total_ms_median=float(np.median(totals)),
         total_ms_p95=float(np.percentile(totals, 95)),
+        last_to_first=float(np.median(totals[-_SPAN:]) / np.median(totals[:_SPAN])),
         stages_ms_median={name: float(np.median(times)) for name, times in stages.items()},
         stages_ms_p95={name: float(np.percentile(times, 95)) for name, times in stages.items()},
         cold_worker=cold_worker(store, config),

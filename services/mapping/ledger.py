@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,6 +58,8 @@ class Ledger:
         self._lock = threading.Lock()
         self._records = FrameRecords()
         self._store = KeyframeStore(config)
+        self._context: TrackingContext | None = None  # the last one asked for
+        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="context")
         self.resumed = self._resume(folder, record.log_ends, config)
         self._log = SessionLog(folder.log_path(record.epoch))
 
@@ -132,7 +135,10 @@ class Ledger:
                 raise ConflictError(f"frame {record.seq} is not newer than {last.seq}")
             with LOG_SECONDS.time():
                 self._log.append(entry)
-            return self._apply(entry)
+            new = self._apply(entry)
+        if new is not None:  # the next frame asks for it: it is there when the frame is decoded
+            self._ahead.submit(self.context, ContextRequest(self.revision, record.seq))
+        return new
 
     def _apply(self, entry: Advance) -> NewKeyframe | None:
         record = entry.record
@@ -149,11 +155,14 @@ class Ledger:
             return self._store.poses()
 
     def context(self, request: ContextRequest) -> TrackingContext:
-        """The neighbourhood of a keyframe."""
+        """The neighbourhood of a keyframe; the last one is kept."""
         with self._lock:
             if request.is_near_only:
                 return self._store.loop_context(request.reference_seq)
-            return self._store.context(request.reference_seq)
+            last, seq = self._context, request.reference_seq
+            if last is None or (last.revision, last.reference_seq) != (self.revision, seq):
+                self._context = last = self._store.context(seq)
+            return last
 
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """Keyframes that look like a frame."""
@@ -177,6 +186,7 @@ class Ledger:
 
     def close(self) -> None:
         """Close the log."""
+        self._ahead.shutdown()
         self._log.close()
 
 

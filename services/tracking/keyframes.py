@@ -132,7 +132,6 @@ class KeyframeParts:
     cloud_camera: PointCloud
     observations: Observations
     correction: Correction
-    edge_blur_px: float
 
 
 def keyframe_data(
@@ -148,7 +147,6 @@ def keyframe_data(
         cloud_camera=thinned(parts.cloud_camera, config.max_cloud_points),
         thumbnail=thumbnail_of(image.rgb),
         correction=parts.correction,
-        edge_blur_px=parts.edge_blur_px,
     )
 
 

@@ -25,11 +25,6 @@ class NormalEquations:
     overlap: float
     residual_scale: float
 
-    def step(self, min_share: float) -> NDArray[np.float64]:
-        """Gauss-Newton step without the directions that nothing holds, be it noise."""
-        basis = known_directions(self.H, self.H, min_share)
-        return -basis @ (basis.T @ self.b)
-
     def projector(self, min_share: float) -> NDArray[np.float64]:
         """Leaves of a twist what the geometry holds, [6, 6]."""
         basis = known_directions(self.H, self.signal, min_share)

@@ -7,7 +7,7 @@ whichever worker gets the frame gives the same result to the bit.
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,14 @@ from services.tracking.stopwatch import Stopwatch
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
 from shared.frames import TrackingStatus, TrackRequest
 from shared.se3 import inverse
-from shared.tracks import NO_LANDMARK, KeyframeData, KeyframeLink, TrackResult
+from shared.tracks import (
+    NO_LANDMARK,
+    KeyframeData,
+    KeyframeLink,
+    LoopConstraint,
+    Observations,
+    TrackResult,
+)
 
 _ALONE = NoHelper()
 
@@ -71,7 +78,7 @@ def track(
     if found.estimate is None:
         return _lost(job, local)
     with clock.stage("keyframe"):
-        keyframe = _new_keyframe(job, found)
+        keyframe = _new_keyframe(job, found, helper)
     return _answer(job, found, keyframe)
 
 
@@ -94,8 +101,8 @@ def _begin(job: Job) -> TrackResult:
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
     observations = keyframe_observations(seq, observed.features, none)
     correction = first_correction(seq, T, observations, observed.intrinsics)
-    blur_px = edge_blur_px(observed.image.rgb)
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+    data = keyframe_data(parts, job.config.surface, job.config.keyframe)
     return TrackResult(
         seq=seq,
         t_ns=request.frame.t_ns,
@@ -108,7 +115,7 @@ def _begin(job: Job) -> TrackResult:
         inlier_share=0.0,
         map_revision=request.map_revision,
         timings_ms=job.clock.times(),
-        keyframe=keyframe_data(parts, job.config.surface, job.config.keyframe),
+        keyframe=replace(data, edge_blur_px=edge_blur_px(observed.image.rgb)),
     )
 
 
@@ -142,7 +149,7 @@ def _without_pose(
     )
 
 
-def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
+def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | None:
     """What the frame brings to the map, or None where the map has no need of it."""
     estimate, observed, config = found.estimate, job.observed, job.config
     assert estimate is not None
@@ -154,22 +161,48 @@ def _new_keyframe(job: Job, found: Found) -> KeyframeData | None:
         return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
         return None
-    sharpness = sharpness_of(observed.image, estimate.local.context.window)
-    if is_too_blurred(sharpness, coverage, observed.image.intrinsics, config.keyframe):
-        return None
     ids = estimate.landmark_ids(len(observed.features.octaves))
     observations = keyframe_observations(frame.seq, observed.features, ids)
-    new = NewKeyframe(frame.seq, estimate.T_world_camera, observations, estimate.registration)
+    inspection = helper.submit(_inspect, job, estimate, coverage, observations)
+    data = _keyframe(job, estimate, observations)
+    inspected = inspection.result()
+    if inspected is None:
+        return None
+    return replace(data, edge_blur_px=inspected.edge_blur_px, loop=inspected.loop)
+
+
+def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> KeyframeData:
+    """The frame's part of the map, with its window adjusted to it."""
+    observed, config, context = job.observed, job.config, estimate.local.context
+    seq, T = job.request.frame.seq, estimate.T_world_camera
+    new = NewKeyframe(seq, T, observations, estimate.registration)
     with job.clock.stage("bundle_adjustment"):
-        correction = adjust_window(new, estimate.local.context, observed.intrinsics, config)
-    blur_px = sharpness.edge_blur_px
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction, blur_px)
-    context = estimate.local.context
+        correction = adjust_window(new, context, observed.intrinsics, config)
+    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
     link = KeyframeLink(context.reference_seq, context.revision, estimate.information)
+    return replace(keyframe_data(parts, config.surface, config.keyframe), link=link)
+
+
+@dataclass(frozen=True)
+class _Inspected:
+    """What is found out about a keyframe while its window is adjusted."""
+
+    edge_blur_px: float
+    loop: LoopConstraint | None
+
+
+def _inspect(
+    job: Job, estimate: Estimate, coverage: Coverage, observations: Observations
+) -> _Inspected | None:
+    """Blur, and an earlier keyframe of the same place; None: too blurred for a keyframe."""
+    observed, config = job.observed, job.config.keyframe
+    with job.clock.stage("sharpness"):
+        sharpness = sharpness_of(observed.image, estimate.local.context.window)
+    if is_too_blurred(sharpness, coverage, observed.image.intrinsics, config):
+        return None
     with job.clock.stage("loop"):
         loop = find_loop(job, estimate, observations)
-    data = keyframe_data(parts, config.surface, config.keyframe)
-    return replace(data, link=link, loop=loop)
+    return _Inspected(sharpness.edge_blur_px, loop)
 
 
 def _coverage(observed: Observed, estimate: Estimate) -> Coverage:

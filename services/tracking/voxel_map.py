@@ -18,8 +18,17 @@ class VoxelLevel:
     voxel_size_m: float
     keys: NDArray[np.int64]  # [capacity], -1 where empty
     rows: NDArray[np.int32]  # [capacity], row of the plane
-    points: NDArray[np.float32]  # [V, 3]
-    normals: NDArray[np.float32]  # [V, 3], unit
+    planes: NDArray[np.float32]  # [V, 6], mean point and unit normal: one look into memory for both
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """Mean points, [V, 3]."""
+        return self.planes[:, :3]
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """Mean normals, unit, [V, 3]."""
+        return self.planes[:, 3:]
 
 
 @dataclass(frozen=True)
@@ -36,8 +45,9 @@ def build_voxel_map(cloud: PointCloud, voxel_sizes_m: tuple[float, ...]) -> Voxe
     counts = np.ones(len(points), np.float32)
     # Sizes are multiples of the finest one, so what shares a small voxel shares the larger ones.
     for size in reversed(voxel_sizes_m):
-        keys, rows, points, directions, normals, counts = _fill(points, normals, counts, size)
-        levels.append(VoxelLevel(size, keys, rows, points, directions))
+        keys, rows, planes, normals, counts = _fill(points, normals, counts, size)
+        levels.append(VoxelLevel(size, keys, rows, planes))
+        points = planes[:, :3]
     return VoxelMap(tuple(reversed(levels)))
 
 
@@ -68,9 +78,10 @@ def find_slot(keys, key):  # pragma: no cover - compiled
     # A block of 4x4x4 voxels lies side by side: neighbours share cache lines.
     block = key & ~((np.int64(3) << 40) | (np.int64(3) << 20) | np.int64(3))
     offset = ((key >> 36) & 48) | ((key >> 18) & 12) | (key & 3)
-    slot = ((((block * np.int64(-7046029254386353131)) >> np.int64(40)) << 6) | offset) & mask
+    mixed = (block ^ (block >> 33)) * np.int64(-49064778989728563)  # as MurmurHash3 ends
+    slot = (((mixed ^ (mixed >> 33)) << 6) | offset) & mask
     while keys[slot] != -1 and keys[slot] != key:
-        slot = (slot + 1) & mask
+        slot = (slot + 65) & mask  # the block after: what meets another block has it whole
     return slot
 
 
@@ -119,14 +130,13 @@ def _fill(points, normals, counts, voxel_size):  # pragma: no cover - compiled
             row[3 + axis] += normals[n, axis]
         row[6] += counts[n]
     keys, rows = _compact(keys, rows, used)
-    means = np.empty((used, 3), np.float32)
-    directions = np.empty((used, 3), np.float32)
+    planes = np.empty((used, 6), np.float32)
     totals = np.empty(used, np.float32)
     for n in range(used):
         row = sums[n]
         totals[n] = row[6]
         length = np.sqrt(row[3] ** 2 + row[4] ** 2 + row[5] ** 2)
         for axis in range(3):
-            means[n, axis] = row[axis] / row[6]
-            directions[n, axis] = row[3 + axis] / length
-    return keys, rows, means, directions, sums[:used, 3:6].astype(np.float32), totals
+            planes[n, axis] = row[axis] / row[6]
+            planes[n, 3 + axis] = row[3 + axis] / length
+    return keys, rows, planes, sums[:used, 3:6].astype(np.float32), totals
