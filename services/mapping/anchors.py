@@ -95,7 +95,7 @@ class AnchorMap:
         sizes = self.rows["scalings"][index, 3:]
         if self.config.gaussians == "neural":
             return sizes
-        return sizes + self.rows["sizes"][index].view(len(index), -1, 3).mean(1)
+        return sizes + self.rows["sizes"][index].view(-1, self.config.children, 3).mean(1)
 
     def append(self, new: NewAnchors, creator_seq: int) -> int:
         """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many.
@@ -141,8 +141,8 @@ class AnchorMap:
         self.rows["position"][index] = torch.from_numpy(moved).to(self.rows["position"])
         self.rows["key"][index] = torch.from_numpy(keys).to(self.device)
         sizes = self.rows["scalings"][index, None, :3].exp()
-        offsets = self.rows["offsets"][index].view(len(index), -1, 3) * sizes
-        self.rows["offsets"][index] = ((offsets @ R.T) / sizes).view(len(index), -1)
+        offsets = self.rows["offsets"][index].view(-1, self.config.children, 3) * sizes
+        self.rows["offsets"][index] = ((offsets @ R.T) / sizes).flatten(1)
 
     def copy(self) -> AnchorMap:
         """What drawing needs of them, as it is now; without optimizer state and statistics."""

@@ -198,7 +198,8 @@ class Mapper:
         self.exposures.restore(as_arrays(groups["exposures"]))
         mapper = as_arrays(groups["mapper"])
         self._background = mapper["background"].copy()
-        self._placed = dict(zip(mapper["placed_seqs"].tolist(), mapper["placed"], strict=True))
+        placed = mapper["placed"].copy()  # else each pose would keep the whole file in memory
+        self._placed = dict(zip(mapper["placed_seqs"].tolist(), placed, strict=True))
         self._squared_errors.extend(mapper["squared_errors"].tolist())
         self.iterations = state.values["iterations"]
         self.revision = state.values["revision"]

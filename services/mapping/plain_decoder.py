@@ -43,11 +43,11 @@ class PlainAnchors:
 
 def decode_plain(visible: PlainAnchors, initial_opacity: float) -> Gaussians:
     """The k Gaussians of each visible anchor; row i * k + j is child j of anchor i."""
-    count = len(visible.index)
+    count, k = visible.opacities.shape
     sizes = visible.scalings[:, None].exp()
-    means = visible.positions[:, None] + visible.offsets.view(count, -1, 3) * sizes[..., :3]
+    means = visible.positions[:, None] + visible.offsets.view(count, k, 3) * sizes[..., :3]
     start = math.log(initial_opacity / (1.0 - initial_opacity))
-    scales = 0.5 * sizes[..., 3:] * visible.sizes.view(count, -1, 3).exp()
+    scales = 0.5 * sizes[..., 3:] * visible.sizes.view(count, k, 3).exp()
     quats = visible.turns.reshape(-1, 4) + visible.turns.new_tensor([1.0, 0.0, 0.0, 0.0])
     return Gaussians(
         means=means.reshape(-1, 3),

@@ -11,7 +11,7 @@ Columns = Mapping[str, tuple[tuple[int, ...], torch.dtype]]
 
 
 class RowTable:
-    """Columns with one row per item; room is doubled, so that adding is cheap."""
+    """Columns with one row per item; room grows by a quarter, so that adding is cheap."""
 
     def __init__(self, columns: Columns, device: torch.device) -> None:
         self._device = device
@@ -77,7 +77,7 @@ class RowTable:
         capacity = len(next(iter(self._columns.values())))
         if size <= capacity:
             return
-        room = max(size, capacity * 3 // 2 + 1024)
+        room = max(size, capacity * 5 // 4 + 1024)
         for name, column in self._columns.items():
             larger = torch.zeros((room, *column.shape[1:]), dtype=column.dtype, device=self._device)
             larger[: self._size] = column[: self._size]

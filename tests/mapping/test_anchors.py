@@ -173,6 +173,17 @@ def test_a_corrected_keyframe_takes_only_its_own_anchors_along():
     np.testing.assert_allclose(anchors.rows["position"][4:], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("gaussians", ["neural", "plain"])
+def test_a_keyframe_without_anchors_can_be_corrected(gaussians):
+    anchors = AnchorMap(AnchorConfig(gaussians=gaussians), torch.device("cpu"))
+    anchors.append(new_anchors(4), creator_seq=0)
+    before = anchors.rows["position"].clone()
+
+    anchors.move(8, se3.exp([0.5, 0.0, 0.0, 0.0, 0.0, 0.3]))
+
+    assert torch.equal(anchors.rows["position"], before)
+
+
 def test_children_turn_with_their_anchor():
     anchors = AnchorMap(CONFIG, torch.device("cpu"))
     anchors.append(new_anchors(3), creator_seq=0)

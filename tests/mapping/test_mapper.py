@@ -74,6 +74,16 @@ def test_a_plain_map_renders_a_view_between_keyframes_well_too(calibration, inse
     assert psnr_db(mapper, 6) > 30.0
 
 
+def test_an_empty_plain_map_is_rendered_as_nothing(calibration, true_pose):
+    config = MappingConfig(anchors=AnchorConfig(gaussians="plain"))
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
+
+    view = mapper.render(RenderRequest(true_pose(0), calibration.colour.intrinsics))
+
+    assert not view.alpha.any()
+    assert not view.confidence.any()
+
+
 def test_rendered_depth_is_the_measured_depth(mapper, insert, calibration, true_pose):
     insert(mapper, 0)
     mapper.iterate(60)

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.rasterizer import room
 from services.mapping.rasterizer import CpuRasterizer, View
 from services.mapping.rasterizer.cpu import Engine
-from services.mapping.rasterizer.scratch import Scratch
+from services.mapping.rasterizer.scratch import MOST_BYTES, Scratch
 from services.mapping.rasterizer.threads import workers
 from shared.camera import Intrinsics
 
@@ -22,7 +22,7 @@ class CountingScratch(Scratch):
         self.new_bytes = 0
 
     def _take(self, num_bytes):
-        known = {id(memory.base) for memory in self._free}
+        known = {id(memory.base) for memory in (*self._free, *self._returned)}
         memory = super()._take(num_bytes)
         if id(memory.base) not in known:
             self.new_bytes += memory.nbytes
@@ -63,6 +63,15 @@ def test_the_next_iterations_ask_the_system_for_no_memory():
         iterate(rasterizer, gaussians)
 
     assert scratch.new_bytes == before
+
+
+def test_what_is_kept_for_the_next_call_is_bounded():
+    scratch = Scratch()
+    lent = [scratch.borrow(MOST_BYTES // 10, np.uint8) for _ in range(30)]
+
+    lent.clear()
+
+    assert 0.8 * MOST_BYTES < scratch.num_bytes <= MOST_BYTES
 
 
 def test_the_work_grows_no_faster_than_the_scene():

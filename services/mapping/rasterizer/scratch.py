@@ -6,6 +6,7 @@ thread at a time.
 
 from __future__ import annotations
 
+import threading
 import weakref
 from collections import deque
 from functools import cache
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 CACHE_LINE = 64  # bytes; a record that straddled two would cost two
+MOST_BYTES = 160 << 20  # kept between calls: an iteration has 60 to 140 MB, now and then a view 300
 _MOST = 96  # arrays kept; two whole iterations of the mapper have fewer
 
 
@@ -25,7 +27,10 @@ class Scratch:
     """
 
     def __init__(self) -> None:
-        self._free: deque[NDArray[np.uint8]] = deque(maxlen=_MOST)
+        self._lock = threading.Lock()
+        self._free: list[NDArray[np.uint8]] = []  # longest ago used first
+        # The last reference may go at any moment, even to the thread that holds the lock.
+        self._returned: deque[NDArray[np.uint8]] = deque()
 
     def borrow(self, size: int, dtype: DTypeLike = np.float32) -> NDArray[Any]:
         """An array of `size` numbers that nobody else has, contents arbitrary.
@@ -36,21 +41,34 @@ class Scratch:
         memory = self._take(num_bytes)
         # Not a slice: views of it must keep alive what the finalizer watches, not its owner.
         lent = np.frombuffer(memory.data[:num_bytes], dtype)
-        weakref.finalize(lent, self._free.append, memory).atexit = False
+        weakref.finalize(lent, self._returned.append, memory).atexit = False
         return lent
 
+    @property
+    def num_bytes(self) -> int:
+        """What is kept for the next call."""
+        with self._lock:
+            self._collect()
+            return sum(memory.size for memory in self._free)
+
     def _take(self, num_bytes: int) -> NDArray[np.uint8]:
-        """A free array that is large enough, but not far too large, or a new one."""
-        for _ in range(len(self._free)):
-            try:
-                memory = self._free.popleft()
-            except IndexError:
-                break
-            if num_bytes <= memory.size <= 2 * num_bytes + 4096:
-                return memory
-            self._free.append(memory)
+        """The least free array that is large enough, but not far too large, or a new one."""
+        with self._lock:
+            self._collect()
+            sizes = [memory.size for memory in self._free]
+            fitting = [s for s in sizes if num_bytes <= s <= 2 * num_bytes + 4096]
+            if fitting:
+                return self._free.pop(sizes.index(min(fitting)))
         memory = np.empty(num_bytes + num_bytes // 4 + CACHE_LINE, np.uint8)
         return memory[-memory.ctypes.data % CACHE_LINE :]
+
+    def _collect(self) -> None:
+        """Take up what came back; let go of what is too much."""
+        while self._returned:
+            self._free.append(self._returned.popleft())
+        total = sum(memory.size for memory in self._free)
+        while total > MOST_BYTES or len(self._free) > _MOST:
+            total -= self._free.pop(0).size
 
 
 @cache
