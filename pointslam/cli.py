@@ -197,8 +197,12 @@ def _refine(arguments: argparse.Namespace) -> None:
 
 
 def _add_export(parser: argparse.ArgumentParser) -> None:
+    from shared.maps import ExportFormat
+    from shared.trajectories import TrajectoryFormat
+
+    formats = [*ExportFormat, *TrajectoryFormat]
     parser.add_argument("source", metavar="DIR|SESSION", help="a run's folder, or a session")
-    parser.add_argument("--format", choices=["ply", "mesh", "tum"], default="ply")
+    parser.add_argument("--format", choices=formats, default=ExportFormat.PLY)
     parser.add_argument("--gateway", metavar="URL", default="http://127.0.0.1:8080")
     parser.add_argument("--out", type=Path, metavar="FILE")
     parser.set_defaults(command=_export)
@@ -206,8 +210,12 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     from pointslam.export import export_source
+    from shared.maps import ExportFormat
+    from shared.trajectories import TrajectoryFormat
 
-    target = export_source(arguments.source, arguments.format, arguments.gateway, arguments.out)
+    name = arguments.format
+    format = TrajectoryFormat(name) if name in set(TrajectoryFormat) else ExportFormat(name)
+    target = export_source(arguments.source, format, arguments.gateway, arguments.out)
     _say(str(target))
 
 

@@ -6,35 +6,54 @@ import shutil
 from pathlib import Path
 
 from pointslam.client import Client, Session
+from pointslam.datasets.lists import read_trajectory
 from pointslam.run import open_saved_session
-from pointslam.run_folder import RunFolder, tum_lines
+from pointslam.run_folder import RunFolder
+from shared.maps import SUFFIXES, ExportFormat
+from shared.trajectories import TrajectoryFormat, trajectory_text
 
-_SUFFIXES = {"ply": ".ply", "mesh": "-mesh.ply", "tum": ".txt"}
 
+def export_source(
+    source: str, format: ExportFormat | TrajectoryFormat, gateway: str, out: Path | None
+) -> Path:
+    """Write the map or the trajectory of a run's folder, or of a session that a gateway serves.
 
-def export_source(source: str, format: str, gateway: str, out: Path | None) -> Path:
-    """Write the map of a run's folder, or of a session that a gateway serves; returns the file.
+    Returns:
+        the file: `out`, or one named after the source in the working folder.
 
     Raises:
         PointSlamError: there is no such run or session, or it cannot be exported.
     """
     folder = RunFolder(Path(source))
-    target = out or Path(f"{Path(source).name}{_SUFFIXES[format]}")
+    target = out or Path(f"{Path(source).name}{_suffix(format)}")
     if not folder.is_run():
         with Client(gateway) as client:
             _write(client.session(source), format, target)
-    elif format == "tum":
-        shutil.copyfile(folder.trajectory("final"), target)
+    elif isinstance(format, TrajectoryFormat):
+        _convert(folder.trajectory("final"), format, target)
     else:
         with open_saved_session(folder, folder.read_record()) as session:
             _write(session, format, target)
     return target
 
 
-def _write(session: Session, format: str, target: Path) -> None:
-    if format != "tum":
-        session.export(format, target)
+def _suffix(format: ExportFormat | TrajectoryFormat) -> str:
+    if isinstance(format, ExportFormat):
+        return f".{SUFFIXES[format]}"
+    return ".txt" if format is TrajectoryFormat.TUM else f".{format}"
+
+
+def _convert(tum: Path, format: TrajectoryFormat, target: Path) -> None:
+    """Write a run's trajectory; as TUM with the stamps as the sequence spells them."""
+    if format is TrajectoryFormat.TUM:
+        shutil.copyfile(tum, target)
         return
-    poses = session.poses("final")
-    stamps = [f"{t_ns // 10**9}.{t_ns % 10**9:09d}" for t_ns, _ in poses]
-    target.write_text(tum_lines(stamps, [T for _, T in poses]))
+    poses = [(pose.t_ns, pose.T_world_camera) for pose in read_trajectory(tum)]
+    target.write_text(trajectory_text(poses, format))
+
+
+def _write(session: Session, format: ExportFormat | TrajectoryFormat, target: Path) -> None:
+    if isinstance(format, ExportFormat):
+        session.export(format, target)
+    else:
+        target.write_text(trajectory_text(session.poses("final"), format))

@@ -46,8 +46,23 @@ class ExportFormat(StrEnum):
     """What a map can be written as."""
 
     PLY = "ply"  # 3DGS splats
+    SPZ = "spz"  # the same at a tenth of the size, quantised
+    GLB = "glb"  # the same as binary glTF, KHR_gaussian_splatting
     MESH = "mesh"  # triangle mesh, PLY
+    MESH_GLB = "mesh-glb"  # triangle mesh, binary glTF
+    POINTS = "points"  # points of the surface with normals, PLY
     SNAPSHOT = "snapshot"  # tar of the session folder, to resume elsewhere
+
+
+SUFFIXES = {
+    ExportFormat.PLY: "ply",
+    ExportFormat.SPZ: "spz",
+    ExportFormat.GLB: "glb",
+    ExportFormat.MESH: "mesh.ply",
+    ExportFormat.MESH_GLB: "mesh.glb",
+    ExportFormat.POINTS: "points.ply",
+    ExportFormat.SNAPSHOT: "tar",
+}
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ class AsyncSession:
             await asyncio.sleep(POLL_S)
 
     async def export(self, format: ExportFormat | str) -> AsyncIterator[bytes]:
-        """The map as a file (ply, mesh or snapshot), piece by piece."""
+        """The map as a file, piece by piece; see `ExportFormat`."""
         params = {"format": str(ExportFormat(format))}
         async for piece in self._client.download(calls.export_path(self.name), params):
             yield piece

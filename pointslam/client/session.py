@@ -205,7 +205,7 @@ class Session:
         return self._client.call(calls.save(self.name))
 
     def export(self, format: ExportFormat | str, path: Path | str) -> None:
-        """The map as a file: ply (splats), mesh or snapshot."""
+        """The map as a file; see `ExportFormat`."""
         params = {"format": str(ExportFormat(format))}
         self._client.download(calls.export_path(self.name), params, Path(path))
 

@@ -68,6 +68,10 @@ _FORMATS = {
     map_service_pb2.MAP_FORMAT_PLY: ExportFormat.PLY,
     map_service_pb2.MAP_FORMAT_MESH: ExportFormat.MESH,
     map_service_pb2.MAP_FORMAT_SNAPSHOT: ExportFormat.SNAPSHOT,
+    map_service_pb2.MAP_FORMAT_SPZ: ExportFormat.SPZ,
+    map_service_pb2.MAP_FORMAT_GLB: ExportFormat.GLB,
+    map_service_pb2.MAP_FORMAT_MESH_GLB: ExportFormat.MESH_GLB,
+    map_service_pb2.MAP_FORMAT_POINTS: ExportFormat.POINTS,
 }
 
 

@@ -15,10 +15,11 @@ from services.gateway.errors import MESSAGE
 from services.gateway.localizer import read_localize
 from services.gateway.poses import TimedPose
 from services.gateway.sessions import CreateRequest, Sessions
-from services.gateway.trajectory import fetch_trajectory, trajectory_json, trajectory_tum
+from services.gateway.trajectory import fetch_trajectory, trajectory_file, trajectory_json
 from shared import codec
 from shared.errors import InputError, UnavailableError
 from shared.se3 import Pose
+from shared.trajectories import TrajectoryFormat
 
 MSGPACK = "application/msgpack"
 
@@ -89,13 +90,15 @@ def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
         # An hour of frames takes seconds to write; frames go on meanwhile.
         return await asyncio.to_thread(lambda: JSONResponse(trajectory_json(trajectory)))
 
-    @router.get("/v1/sessions/{name}/trajectory.tum")
-    async def get_trajectory_tum(
-        name: str, kind: Annotated[str, Query(pattern="^(online|final)$")] = "final"
+    @router.get("/v1/sessions/{name}/trajectory.{format}")
+    async def get_trajectory_file(
+        name: str,
+        format: TrajectoryFormat,
+        kind: Annotated[str, Query(pattern="^(online|final)$")] = "final",
     ) -> Response:
-        """The trajectory as a TUM file (t tx ty tz qx qy qz qw), one line a tracked frame."""
+        """The trajectory as a TUM, KITTI or CSV (EuRoC) file, one line a tracked frame."""
         trajectory = await fetch_trajectory(await sessions.get(name))
-        text = await asyncio.to_thread(trajectory_tum, trajectory, kind)
+        text = await asyncio.to_thread(trajectory_file, trajectory, format, kind)
         return Response(text, media_type="text/plain")
 
 

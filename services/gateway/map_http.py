@@ -16,9 +16,7 @@ from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from services.gateway.views import MEDIA_TYPES, View, intrinsics_from, mean_confidence, pose_from
-from shared.maps import ExportFormat, RenderRequest
-
-_SUFFIXES = {ExportFormat.PLY: "ply", ExportFormat.MESH: "mesh.ply", ExportFormat.SNAPSHOT: "tar"}
+from shared.maps import SUFFIXES, ExportFormat, RenderRequest
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def _add_file_routes(router: APIRouter, sessions: Sessions) -> None:
 
     @router.get("/v1/sessions/{name}/map", response_class=StreamingResponse, responses=responses)
     async def get_map(name: str, format: ExportFormat) -> Response:
-        """The map as a file: splats, a triangle mesh, or a snapshot to resume elsewhere."""
+        """The map as a file: splats, a mesh, points, or a snapshot to resume elsewhere."""
         return await _file(await sessions.get(name), format, sessions.fabric.config)
 
 
@@ -142,7 +140,7 @@ async def _file(session: Session, format: ExportFormat, config: GatewayConfig) -
         async for piece in pieces:
             yield piece.bytes
 
-    name = f"{session.name}.{_SUFFIXES[format]}"
+    name = f"{session.name}.{SUFFIXES[format]}"
     headers = {
         "Content-Length": str(first.total),
         "Content-Disposition": f'attachment; filename="{name}"',

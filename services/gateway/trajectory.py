@@ -1,4 +1,4 @@
-"""Trajectories as JSON and as TUM files."""
+"""Trajectories as JSON and as files."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from services.gateway.session import Session
 from shared import codec
 from shared.frames import HAS_POSE
 from shared.maps import Trajectory, TrajectoryRequest
-from shared.se3 import Pose, quat_xyzw_from_rotation
+from shared.se3 import Pose
+from shared.trajectories import TrajectoryFormat, trajectory_text
 
 _FLUSH_S = 10.0
-_NS = 1_000_000_000
 
 
 async def fetch_trajectory(session: Session) -> Trajectory:
@@ -41,13 +41,12 @@ def trajectory_json(trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def trajectory_tum(trajectory: Trajectory, kind: str) -> str:
-    """Lines of a TUM file; `kind` is online (as told) or final (as the map is now)."""
-    lines = []
-    for record, T_final in zip(trajectory.records, trajectory.T_world_cameras_final, strict=True):
-        if record.status in HAS_POSE:
-            T = record.T_world_camera if kind == "online" else T_final
-            numbers = [*T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])]
-            stamp = f"{record.t_ns // _NS}.{record.t_ns % _NS:09d}"
-            lines.append(" ".join([stamp, *(f"{float(n):.9f}" for n in numbers)]))
-    return "".join(line + "\n" for line in lines)
+def trajectory_file(trajectory: Trajectory, format: TrajectoryFormat, kind: str) -> str:
+    """All frames with a pose; `kind` is online (as told) or final (as the map is now)."""
+    finals = trajectory.T_world_cameras_final
+    poses = [
+        (record.t_ns, record.T_world_camera if kind == "online" else T_final)
+        for record, T_final in zip(trajectory.records, finals, strict=True)
+        if record.status in HAS_POSE
+    ]
+    return trajectory_text(poses, format)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 MAX_DEGREE = 3
@@ -36,6 +38,11 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             -a * x * (x * x - 3 * y * y),
         ]
     return torch.stack(functions, dim=1)
+
+
+def mean_colour(harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The colour over all directions, [N, 3], of coefficients [N, B, 3]."""
+    return 0.5 + np.float32(_C0) * harmonics[:, 0]
 
 
 class LeastSquares:

@@ -1,4 +1,4 @@
-"""The map as a triangle mesh: rendered depth of all keyframes fused by Open3D's TSDF."""
+"""The map as a triangle mesh or a cloud: rendered depth of all keyframes fused by Open3D's TSDF."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from services.mapping.glb import TRIANGLES, Primitive, glb_bytes
 from services.mapping.pipeline import Mapper
 from shared import se3
 from shared.errors import UnavailableError
@@ -28,8 +29,8 @@ _INSTALL = (
 Visit = Callable[[Callable[[Mapper], Any]], Any]
 
 
-def export_mesh(visit: Visit) -> bytes:
-    """A coloured mesh as PLY.
+def mesh_ply(visit: Visit) -> bytes:
+    """A mesh as PLY, with colours, in the map's own axes.
 
     Args:
         visit: asks the mapper between two of its iterations; once for each keyframe here.
@@ -37,16 +38,43 @@ def export_mesh(visit: Visit) -> bytes:
     Raises:
         UnavailableError: Open3D or its system libraries are absent, or the map has no surface.
     """
+    open3d, mesh = _fused(visit, "extract_triangle_mesh")
+    return _written(open3d.io.write_triangle_mesh, "mesh.ply", mesh.to_legacy())
+
+
+def mesh_glb(visit: Visit) -> bytes:
+    """A mesh as binary glTF, with colours, y up; for the rest see `mesh_ply`."""
+    _, mesh = _fused(visit, "extract_triangle_mesh")
+    positions = mesh.vertex.positions.numpy() * np.array([1, -1, -1], np.float32)
+    colours = np.rint(255.0 * mesh.vertex.colors.numpy().clip(0.0, 1.0)).astype(np.uint8)
+    opaque = np.concatenate([colours, np.full_like(colours[:, :1], 255)], axis=1)
+    attributes = {"POSITION": positions.astype(np.float32), "COLOR_0": opaque}
+    return glb_bytes(Primitive(TRIANGLES, attributes, mesh.triangle.indices.numpy().astype("<u4")))
+
+
+def cloud_ply(visit: Visit) -> bytes:
+    """Points of the surface as PLY, with normals and colours; for the rest see `mesh_ply`."""
+    open3d, cloud = _fused(visit, "extract_point_cloud")
+    return _written(open3d.io.write_point_cloud, "cloud.ply", cloud.to_legacy())
+
+
+def _fused(visit: Visit, extract: str) -> tuple[Any, Any]:
+    """Open3D, and what its grid's method `extract` makes of all keyframes."""
     open3d = _open3d()
     grid = _grid(open3d)
     for seq in visit(lambda mapper: mapper.views.seqs()):
         _integrate(open3d, grid, *visit(lambda mapper, seq=seq: _rendered(mapper, seq)))
-    mesh = grid.extract_triangle_mesh(weight_threshold=MIN_WEIGHT)
-    if len(mesh.vertex.positions) == 0:
+    surface = getattr(grid, extract)(weight_threshold=MIN_WEIGHT)
+    points = surface.vertex if extract == "extract_triangle_mesh" else surface.point
+    if len(points.positions) == 0:
         raise UnavailableError("the map has no surface yet")
+    return open3d, surface
+
+
+def _written(write: Callable[[str, Any], bool], name: str, surface: Any) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.ply"
-        open3d.io.write_triangle_mesh(str(path), mesh.to_legacy())
+        path = Path(folder) / name
+        write(str(path), surface)
         return path.read_bytes()
 
 

@@ -11,13 +11,12 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from services.mapping.baking import MapCopy, bake
 from services.mapping.config import MappingConfig
-from services.mapping.export import pack_folder, spooled, write_ply
+from services.mapping.export import pack_folder, spooled
 from services.mapping.exports import Exports
 from services.mapping.figures import MapFigures
 from services.mapping.ledger import Ledger, Resumed
-from services.mapping.mesh import export_mesh
+from services.mapping.map_files import write_map
 from services.mapping.metrics import SNAPSHOT_SECONDS
 from services.mapping.pipeline import Mapper
 from services.mapping.refinement import Refinement
@@ -167,12 +166,8 @@ class Session:
                 self.save()
             with self._saving:
                 return pack_folder(path)
-        if format is ExportFormat.MESH:
-            mesh = export_mesh(self._worker.visit)
-            return spooled(lambda file: file.write(mesh), path)
-        degree = self._surroundings.config.export.harmonics_degree
-        blocks = bake(self._worker.visit(MapCopy.of), degree)
-        return spooled(lambda file: write_ply(file, blocks, degree), path)
+        visit, config = self._worker.visit, self._surroundings.config.export
+        return spooled(lambda file: write_map(file, format, visit, config), path)
 
     @property
     def refinement(self) -> JobStatus:

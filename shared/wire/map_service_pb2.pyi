@@ -27,6 +27,10 @@ class MapFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     MAP_FORMAT_PLY: _ClassVar[MapFormat]
     MAP_FORMAT_MESH: _ClassVar[MapFormat]
     MAP_FORMAT_SNAPSHOT: _ClassVar[MapFormat]
+    MAP_FORMAT_SPZ: _ClassVar[MapFormat]
+    MAP_FORMAT_GLB: _ClassVar[MapFormat]
+    MAP_FORMAT_MESH_GLB: _ClassVar[MapFormat]
+    MAP_FORMAT_POINTS: _ClassVar[MapFormat]
 VIEW_CONTENT_UNSPECIFIED: ViewContent
 VIEW_CONTENT_COLOUR: ViewContent
 VIEW_CONTENT_DEPTH: ViewContent
@@ -39,6 +43,10 @@ MAP_FORMAT_UNSPECIFIED: MapFormat
 MAP_FORMAT_PLY: MapFormat
 MAP_FORMAT_MESH: MapFormat
 MAP_FORMAT_SNAPSHOT: MapFormat
+MAP_FORMAT_SPZ: MapFormat
+MAP_FORMAT_GLB: MapFormat
+MAP_FORMAT_MESH_GLB: MapFormat
+MAP_FORMAT_POINTS: MapFormat
 
 class GetMapInfoRequest(_message.Message):
     __slots__ = ("session_id",)

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from services.mapping.baking import BakedGaussians
-from services.mapping.export import write_ply
 from services.mapping.exports import MAX_OPEN, Exports
 from services.mapping.rasterizer import Gaussians
+from services.mapping.splat_ply import write_ply
+from services.mapping.splats import Splats
 from shared.errors import NotFoundError
 
 
@@ -29,7 +30,7 @@ def baked(count: int = 4, degree: int = 0) -> BakedGaussians:
 
 
 def ply_bytes(*blocks: BakedGaussians, degree: int = 0) -> bytes:
-    write_ply(file := io.BytesIO(), blocks, degree)
+    write_ply(file := io.BytesIO(), map(Splats.of, blocks), degree)
     return file.getvalue()
 
 

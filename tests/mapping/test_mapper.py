@@ -16,7 +16,6 @@ from services.mapping.config import (
     MappingConfig,
     ScheduleConfig,
 )
-from services.mapping.mesh import export_mesh
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.rasterizer import Gaussians, View
 from shared import se3
@@ -357,16 +356,3 @@ def test_a_keyframe_without_depth_does_no_harm(mapper, insert, frame, true_pose)
     mapper.iterate(2)
 
     assert added == 0
-
-
-def test_a_mesh_lies_on_the_room(mapper, insert, tmp_path):
-    open3d = pytest.importorskip("open3d", exc_type=ImportError)
-    insert(mapper, 0)
-    mapper.iterate(60)
-
-    (tmp_path / "mesh.ply").write_bytes(export_mesh(lambda question: question(mapper)))
-
-    vertices = np.asarray(open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
-    distances = np.minimum(np.abs(vertices[:, 2] - 2.0), np.abs(vertices[:, 1] - 0.8))
-    assert len(vertices) > 100
-    assert np.median(distances) < 0.02
