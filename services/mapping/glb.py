@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Attribute = NDArray[np.float32] | NDArray[np.uint8] | NDArray[np.uint32]
+Attribute = NDArray[np.number]  # float32, uint32 or uint8
 
 POINTS, TRIANGLES = 0, 4  # modes of a primitive
 _GENERATOR = "PointSLAM++"

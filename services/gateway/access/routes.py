@@ -48,7 +48,7 @@ HTTP: dict[str, Access] = {
     f"POST {_SESSION}/localize": POSE,
     f"GET {_SESSION}/pose": POSE,
     f"GET {_SESSION}/trajectory": POSE,
-    f"GET {_SESSION}/trajectory.tum": POSE,
+    f"GET {_SESSION}/trajectory.{{format}}": POSE,
     f"GET {_SESSION}/render": RENDER,
     f"GET {_SESSION}/map.ply": RENDER,
     f"GET {_SESSION}/map": RENDER,
