@@ -57,13 +57,18 @@ class Cluster:
 
     def rss_mb(self, name: str) -> float:
         """Memory that a process holds now, MB."""
-        pages = Path(f"/proc/{self._processes[name].pid}/statm").read_text().split()[1]
-        return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        return rss_mb(self._processes[name].pid)
 
     def wait_until_ready(self) -> None:
         """Wait until sessions can be created and tracked."""
         with Client(self.url) as client:
             wait_for(client.ready)
+
+
+def rss_mb(pid: int) -> float:
+    """Memory that a process of this machine holds now, MB."""
+    pages = Path(f"/proc/{pid}/statm").read_text().split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 @contextmanager

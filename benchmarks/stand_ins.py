@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -51,6 +52,7 @@ from shared.tracks import (
 
 STEP_M = 0.01  # the camera moves so far along x from one frame number to the next
 KEYFRAME_EVERY = 10
+_CONCURRENT_FRAMES = 2  # of one tracker, as of a real one
 
 
 class StandInTracker:
@@ -64,7 +66,8 @@ class StandInTracker:
         self.requests: list[TrackRequest] = []
         self.leave = bus.close
         self.images: list[LocalizeRequest] = []
-        bus.serve(Keys.track(name), TrackRequest, self.answer)
+        self._executor = ThreadPoolExecutor(_CONCURRENT_FRAMES, thread_name_prefix=name)
+        bus.serve(Keys.track(name), TrackRequest, self.answer, self._executor)
         bus.serve(Keys.localize(name), LocalizeRequest, self.localize)
         bus.declare_alive("tracking", name)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,10 @@ class Frame:
 
     def digest(self) -> int:
         """CRC-32 of both images: a frame that has that of the one before it is a repeat."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> int:
         return zlib.crc32(self.depth.bytes, zlib.crc32(self.rgb.bytes))
 
 

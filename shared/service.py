@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import logging
 import os
@@ -105,7 +106,13 @@ def stop_event() -> threading.Event:
 
 
 def announce_ready(name: str) -> None:
-    """Tell whoever started this process that it serves: one line on standard output."""
+    """Tell whoever started this process that it serves: one line on standard output.
+
+    What it has loaded by now stays to its end, so no collection of garbage looks through it any
+    more: that took 60 ms of a gateway's event loop each time.
+    """
+    gc.collect()
+    gc.freeze()
     sys.stdout.write(f"READY {name}\n")
     sys.stdout.flush()
 
