@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from benchmarks.empty_keyframe import empty_keyframe
 from shared import se3
 from shared.bus import Bus, Keys
-from shared.errors import ConflictError, NotFoundError
+from shared.errors import ClaimLostError, ConflictError, NotFoundError
 from shared.frames import HAS_POSE, TrackingStatus, TrackRequest
 from shared.images import decode_colour, decode_depth
 from shared.localization import LocalizationStatus, LocalizeRequest, LocalizeResult
@@ -39,14 +40,13 @@ from shared.maps import (
 )
 from shared.tracks import (
     Advance,
+    Advanced,
     AdvanceReply,
-    Correction,
-    KeyframeData,
+    ClaimReply,
+    ClaimRequest,
     KeyframePoses,
-    Observations,
     OpenReply,
     OpenRequest,
-    PointCloud,
     TrackResult,
 )
 
@@ -96,7 +96,7 @@ class StandInTracker:
             inlier_share=0.5,
             map_revision=request.map_revision,
             timings_ms={"decode": 1.0},
-            keyframe=_keyframe() if is_keyframe and self.status in HAS_POSE else None,
+            keyframe=empty_keyframe() if is_keyframe and self.status in HAS_POSE else None,
         )
 
     def localize(self, request: LocalizeRequest) -> LocalizeResult:
@@ -123,29 +123,11 @@ class StandInTracker:
         )
 
 
-def _keyframe() -> KeyframeData:
-    nothing = np.zeros((0, 3), np.float32)
-    observations = Observations(
-        landmark_ids=np.zeros(0, np.int64),
-        keypoints_px=np.zeros((0, 2), np.float32),
-        octaves=np.zeros(0, np.uint8),
-        depths_m=np.zeros(0, np.float32),
-        descriptors=np.zeros((0, 32), np.uint8),
-    )
-    correction = Correction(
-        keyframe_seqs=np.zeros(0, np.int64),
-        T_world_keyframes=np.zeros((0, 4, 4)),
-        landmark_ids=np.zeros(0, np.int64),
-        positions_world=np.zeros((0, 3)),
-    )
-    thumbnail = np.zeros((15, 20), np.uint8)
-    return KeyframeData(observations, nothing, PointCloud(nothing, nothing), thumbnail, correction)
-
-
 @dataclass
 class _Map:
     request: OpenRequest
     epoch: int
+    claim: int = 0
     entries: list[Advance] = field(default_factory=list)
     refinement: JobStatus = field(default_factory=JobStatus)
     stops: list = field(default_factory=list)
@@ -189,9 +171,12 @@ class StandInMapper:
             known.epoch += 1
             self.disk[request.session] = known
             self._serve(request.session, known)
+        return self._opening(request.session, known)
+
+    def _opening(self, session: str, known: _Map) -> OpenReply:
         assert known.request.calibration is not None
         return OpenReply(
-            session=request.session,
+            session=session,
             mapper=self.name,
             epoch=known.epoch,
             mode=known.request.mode,
@@ -201,7 +186,24 @@ class StandInMapper:
             T_world_first=known.request.T_world_first,
             last=known.entries[-1].record if known.entries else None,
             keyframe_poses=known.poses(),
+            prior=known.entries[-1].prior if known.entries else None,
         )
+
+    def _claim(self, session: str, known: _Map, request: ClaimRequest) -> ClaimReply:
+        if 0 < request.held == known.claim:
+            return ClaimReply(known.claim, None)
+        known.claim += 1
+        self._bus.publish(Keys.advanced(session), Advanced(known.claim, len(known.keyframes())))
+        return ClaimReply(known.claim, self._opening(session, known))
+
+    def _advance(self, session: str, known: _Map, entry: Advance) -> AdvanceReply:
+        if entry.claim < known.claim:
+            raise ClaimLostError(f"claim {known.claim} is newer")
+        if not known.entries or entry.record.seq > known.entries[-1].record.seq:
+            known.entries.append(entry)
+            news = Advanced(known.claim, len(known.keyframes()), entry.record)
+            self._bus.publish(Keys.advanced(session), news)
+        return AdvanceReply(known.entries[-1].record.seq, len(known.keyframes()))
 
     def list(self, _: Empty) -> SessionList:
         """All sessions."""
@@ -221,7 +223,8 @@ class StandInMapper:
 
     def _serve(self, session: str, known: _Map) -> None:
         answers = {
-            "advance": (Advance, lambda entry: _advance(known, entry)),
+            "claim": (ClaimRequest, lambda request: self._claim(session, known, request)),
+            "advance": (Advance, lambda entry: self._advance(session, known, entry)),
             "keyframes": (Empty, lambda _: known.poses()),
             "render": (RenderRequest, lambda request: _render(known, request)),
             "export": (ExportRequest, _export),
@@ -260,12 +263,6 @@ class StandInMapper:
             map_bytes=0,
             device="cpu",
         )
-
-
-def _advance(known: _Map, entry: Advance) -> AdvanceReply:
-    if not known.entries or entry.record.seq > known.entries[-1].record.seq:
-        known.entries.append(entry)
-    return AdvanceReply(known.entries[-1].record.seq, len(known.keyframes()))
 
 
 def _render(known: _Map, request: RenderRequest) -> RenderReply:

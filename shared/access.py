@@ -13,7 +13,7 @@ from shared.keys import ROOT
 _FRAMES = (f"{ROOT}/track/**",)
 _MAPS = (f"{ROOT}/mapper/**", f"{ROOT}/session/**")
 _CONTEXTS = (f"{ROOT}/session/*/*/context", f"{ROOT}/session/*/*/candidates")
-_NEWS = (f"{ROOT}/revision/*", f"{ROOT}/claim/*")
+_NEWS = (f"{ROOT}/revision/*", f"{ROOT}/advanced/*")
 
 
 def _alive(role: str) -> tuple[str, ...]:

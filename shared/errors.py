@@ -51,6 +51,12 @@ class ConflictError(PointSlamError):
     code = "conflict"
 
 
+class ClaimLostError(ConflictError):
+    """Another gateway advances the session by now: go on there, or claim the session anew."""
+
+    code = "claim_lost"
+
+
 class UnavailableError(PointSlamError):
     """A service that the request needs is absent, gone or too slow: try again later."""
 

@@ -32,9 +32,10 @@ class Keys:
     def session(session: str, epoch: int, question: str) -> str:
         """Queries to the owner of a session's map in one epoch.
 
-        advance (Advance, AdvanceReply), context (ContextRequest, TrackingContext),
-        candidates (CandidatesRequest, Candidates), keyframes (Empty, KeyframePoses),
-        render (RenderRequest, RenderReply), export (ExportRequest, ExportChunk),
+        claim (ClaimRequest, ClaimReply), advance (Advance, AdvanceReply),
+        context (ContextRequest, TrackingContext), candidates (CandidatesRequest, Candidates),
+        keyframes (Empty, KeyframePoses), render (RenderRequest, RenderReply),
+        export (ExportRequest, ExportChunk),
         refine (RefineRequest, JobStatus), refinement (Empty, JobStatus), interrupt (Empty,
         JobStatus), save (SaveRequest, SaveReply), info (Empty, MapInfo),
         trajectory (TrajectoryRequest, Trajectory).
@@ -45,6 +46,11 @@ class Keys:
     def revisions(session: str) -> str:
         """Publications of KeyframePoses."""
         return f"{ROOT}/revision/{session}"
+
+    @staticmethod
+    def advanced(session: str) -> str:
+        """Publications of Advanced."""
+        return f"{ROOT}/advanced/{session}"
 
     @staticmethod
     def alive(role: str, name: str) -> str:
@@ -58,6 +64,7 @@ class Keys:
 
 
 _PRIORITIES = {
+    "claim": Priority.DATA_HIGH,
     "context": Priority.DATA_HIGH,
     "candidates": Priority.DATA_HIGH,
     "localize": Priority.DATA_LOW,

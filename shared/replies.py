@@ -11,6 +11,7 @@ import zenoh
 
 from shared import codec
 from shared.errors import (
+    ClaimLostError,
     ConfigError,
     ConflictError,
     InputError,
@@ -26,7 +27,14 @@ LOGGER = logging.getLogger(__name__)
 
 _ERRORS: dict[str, type[PointSlamError]] = {
     kind.code: kind
-    for kind in (ConfigError, ConflictError, NotFoundError, StorageError, UnavailableError)
+    for kind in (
+        ClaimLostError,
+        ConfigError,
+        ConflictError,
+        NotFoundError,
+        StorageError,
+        UnavailableError,
+    )
 }
 
 

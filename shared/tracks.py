@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.camera import Calibration
-from shared.frames import Frame, TrackingStatus
+from shared.frames import Frame, Prior, TrackingStatus
 
 NO_LANDMARK = -1
 KEYPOINT_BITS = 16
@@ -160,9 +160,15 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class Advance:
-    """One entry of a session's log: an answered frame and, for a keyframe, all that it brings."""
+    """One entry of a session's log: an answered frame and, for a keyframe, all that it brings.
+
+    `claim` is the number under which the sender advances the session; `prior` is what the next
+    frame starts from, so that whoever takes the session up goes on as if nothing had happened.
+    """
 
     record: FrameRecord
+    claim: int = field(default=0, kw_only=True)
+    prior: Prior | None = field(default=None, kw_only=True)
     frame: Frame | None = None  # the encoded images, for keyframes
     keyframe: KeyframeData | None = None
 
@@ -248,3 +254,32 @@ class OpenReply:
     T_world_first: NDArray[np.float64]
     last: FrameRecord | None
     keyframe_poses: KeyframePoses
+    prior: Prior | None = None  # after the last frame; None too in a log of older versions
+
+
+@dataclass(frozen=True)
+class ClaimRequest:
+    """A gateway wants to advance a session; `held` is the number of its claim, if it has one."""
+
+    gateway: str
+    held: int = 0
+
+
+@dataclass(frozen=True)
+class ClaimReply:
+    """The newest claim; older ones advance nothing any more.
+
+    `opened` is the session as it is now; None where the asker's claim is the newest.
+    """
+
+    number: int
+    opened: OpenReply | None
+
+
+@dataclass(frozen=True)
+class Advanced:
+    """Published by the owner with every frame that it logs, and without one for a new claim."""
+
+    claim: int
+    map_revision: int
+    record: FrameRecord | None = None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from shared import codec
 from shared.camera import Calibration, Intrinsics
 from shared.errors import (
+    ClaimLostError,
     ConfigError,
     ConflictError,
     ForbiddenError,
@@ -40,6 +41,7 @@ T = TypeVar("T")
 _KINDS: dict[str, type[PointSlamError]] = {
     kind.code: kind
     for kind in (
+        ClaimLostError,
         ConfigError,
         ConflictError,
         ForbiddenError,

@@ -65,7 +65,7 @@ def main(argv: list[str]) -> None:
     with listener, open_bus(endpoints(arguments), config.bus) as bus:
         loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
         with asyncio.Runner(loop_factory=loop_factory) as runner:
-            runner.run(_serve(bus, config, listener, door))
+            runner.run(_serve(bus, config, listener, door, arguments.id))
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -78,8 +78,11 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-async def _serve(bus: Bus, config: GatewayConfig, listener: socket.socket, door: GrpcDoor) -> None:
-    sessions = open_sessions(bus, config)
+async def _serve(
+    bus: Bus, config: GatewayConfig, listener: socket.socket, door: GrpcDoor, name: str
+) -> None:
+    sessions = open_sessions(bus, config, name)
+    forgetting = asyncio.create_task(sessions.forget_idle())
     server = _Server(_uvicorn_config(create_app(sessions, door.authority), config, door.tls))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -88,6 +91,7 @@ async def _serve(bus: Bus, config: GatewayConfig, listener: socket.socket, door:
         async with serve_grpc(sessions, door):
             await server.serve([listener])
     finally:
+        forgetting.cancel()
         await sessions.close()
 
 

@@ -35,10 +35,10 @@ tenant, whose sessions are all that it can see. A browser's sockets and event st
 too much at once (see Retry-After)."""
 
 
-def open_sessions(bus: Bus, config: GatewayConfig) -> Sessions:
+def open_sessions(bus: Bus, config: GatewayConfig, name: str = "gateway") -> Sessions:
     """The sessions of a gateway on this bus; call it on the event loop."""
     trackers = TrackerPool(bus, Members(bus, "tracking"), config.dispatch)
-    return Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config))
+    return Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config, name))
 
 
 def create_app(sessions: Sessions, authority: Authority) -> FastAPI:

@@ -71,6 +71,7 @@ class MappingConfig:
     reopen_wait_s: float = 60.0  # how long a session waits for a live mapper
     retry_s: float = 0.2
     live_entries: int = 256  # answered frames that a live session holds unacknowledged
+    claim_wait_s: float = 1.0  # for the owner to say that a session is still ours
     keyframe_wait_s: float = 0.25  # a live session waits so long for a keyframe's acknowledgement
 
     def __post_init__(self) -> None:
@@ -133,4 +134,5 @@ class GatewayConfig:
     stream: StreamConfig = field(default_factory=StreamConfig)
     access: AccessConfig = field(default_factory=AccessConfig)
     bus: BusConfig = field(default_factory=BusConfig)
+    session_idle_s: float = 600.0  # a session that nobody uses for so long is forgotten here
     drain_s: float = 10.0  # time to finish what is in flight at SIGTERM

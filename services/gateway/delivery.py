@@ -8,7 +8,13 @@ from collections import deque
 
 from services.gateway.config import MappingConfig
 from services.gateway.owner import MapOwner
-from shared.errors import ConflictError, InputError, PointSlamError, UnavailableError
+from shared.errors import (
+    ClaimLostError,
+    ConflictError,
+    InputError,
+    PointSlamError,
+    UnavailableError,
+)
 from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
@@ -36,8 +42,11 @@ class Delivery:
         """Add an entry; waits while the ring is full.
 
         Raises:
+            ClaimLostError: another gateway advances the session by now.
             PointSlamError: the ring is full because the owner refuses what is in it.
         """
+        if isinstance(self._failure, ClaimLostError):
+            raise self._failure
         async with self._changed:
             while len(self._entries) >= self._config.live_entries:
                 if self._failure is not None:
@@ -78,10 +87,18 @@ class Delivery:
         for end in ends:
             end.cancel()
 
-    def close(self) -> None:
-        """Give up what is not acknowledged."""
+    def give_up(self) -> None:
+        """Send nothing more and forget what is not acknowledged; new entries may come."""
         if self._task is not None:
             self._task.cancel()
+            self._task = None
+        self._forget()
+        self._failure = None
+
+    def _forget(self) -> None:
+        if self._entries:
+            LOGGER.warning("%s: %d frames not delivered", self._owner.session, len(self._entries))
+        self._entries.clear()
 
     async def _taken_or_refused(self) -> None:
         async with self._changed:
@@ -92,6 +109,10 @@ class Delivery:
             try:
                 if self._entries[0].record.seq > self._owner.logged_seq:
                     await self._owner.advance(self._entries[0])
+            except ClaimLostError as error:
+                self._forget()
+                await self._tell(error)
+                return
             except (InputError, ConflictError) as error:
                 # It would be refused for ever, and everything behind it would wait.
                 seq = self._entries[0].record.seq

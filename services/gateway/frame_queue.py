@@ -39,7 +39,7 @@ class FrameQueue:
         answer: Callable[[FrameMessage, float], Awaitable[FrameReply]],
         is_live: bool,
         max_waiting: int,
-        newest: tuple[int, int],
+        newest: tuple[int, int] = (-1, -1),
     ) -> None:
         self._answer = answer
         self._is_live = is_live
@@ -62,24 +62,38 @@ class FrameQueue:
         elif len(self._waiting) >= self._max_waiting:
             raise UnavailableError(f"{len(self._waiting)} frames of this session wait already")
         future: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Waiting(message, future, time.perf_counter()))
-        if self._task is None or self._task.done():
+        admitted = _Waiting(message, future, time.perf_counter())
+        if self._in_flight is None:
+            self._in_flight = admitted  # at once: no later frame may take its place
             self._task = asyncio.create_task(self._work())
+        else:
+            self._waiting.append(admitted)
         return future
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame waits or is under way."""
+        return self._in_flight is None and not self._waiting
 
     async def finish(self) -> None:
         """Wait until every admitted frame is answered."""
         if self._task is not None:
             await asyncio.wait([self._task])
 
-    def close(self) -> None:
-        """Stop; frames that wait are refused."""
+    def resume(self, newest: tuple[int, int]) -> None:
+        """Go on behind the newest answered frame (seq, t_ns), whoever answered it."""
+        self._answered = newest
+
+    def refuse(self, reason: PointSlamError) -> None:
+        """Stop; frames that are under way or wait are refused. New ones may come."""
         if self._task is not None:
             self._task.cancel()
+            self._task = None
         if self._in_flight is not None:
             self._waiting.appendleft(self._in_flight)
+            self._in_flight = None
         while self._waiting:
-            _settle(self._waiting.popleft(), UnavailableError("the session was closed"))
+            _settle(self._waiting.popleft(), reason)
 
     def _check_order(self, message: FrameMessage) -> None:
         seq, t_ns = self._newest()
@@ -101,10 +115,9 @@ class FrameQueue:
             _settle(old, FrameReply(old.message.seq, old.message.t_ns, status))
 
     async def _work(self) -> None:
-        while self._waiting:
-            self._in_flight = current = self._waiting.popleft()
+        while (current := self._in_flight) is not None:
             _settle(current, await self._outcome(current))
-            self._in_flight = None
+            self._in_flight = self._waiting.popleft() if self._waiting else None
 
     async def _outcome(self, current: _Waiting) -> Outcome:
         waited_ms = 1e3 * (time.perf_counter() - current.since_s)

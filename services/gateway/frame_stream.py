@@ -35,6 +35,7 @@ class FrameStream:
         self._room = asyncio.Semaphore(config.live_unanswered if session.is_live else config.credit)
         self._answers: asyncio.Queue[tuple[int, int, asyncio.Future[Outcome]] | None]
         self._answers = asyncio.Queue()
+        self._has_claim = False  # taken once: a stream that loses the session does not fight for it
 
     async def run(self, read: Callable[[FrameStream], Awaitable[None]]) -> None:
         """Serve until `read`, which puts the frames, ends and they are answered.
@@ -45,7 +46,8 @@ class FrameStream:
         writer = asyncio.create_task(self._write())
         reader = asyncio.create_task(self._read(read))
         try:
-            await asyncio.wait({writer, reader}, return_when=asyncio.FIRST_COMPLETED)
+            with self._session.in_use():
+                await asyncio.wait({writer, reader}, return_when=asyncio.FIRST_COMPLETED)
             if not writer.done():
                 reader.result()
             await writer
@@ -62,6 +64,9 @@ class FrameStream:
         """
         await self._room.acquire()
         try:
+            if not self._has_claim:
+                await self._session.claim()
+                self._has_claim = True
             message = read()
             seq, t_ns = message.seq, message.t_ns
             future = self._session.submit(message)

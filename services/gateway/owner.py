@@ -32,12 +32,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Fabric:
-    """What every session uses: the bus, the live processes, the settings."""
+    """What every session uses: the bus, the live processes, the settings, who we are."""
 
     bus: Bus
     trackers: TrackerPool
     mappers: Members
     config: GatewayConfig
+    name: str = "gateway"
 
 
 class MapOwner:
@@ -149,16 +150,17 @@ class MapOwner:
         except UnavailableError as error:
             LOGGER.info("%s: %s", self.session, error)
             return False
-        self._take(opened)
-        return True
-
-    def _take(self, opened: OpenReply) -> None:
         LOGGER.warning(
             "%s: map now owned by %s, epoch %d", self.session, opened.mapper, opened.epoch
         )
+        TAKEOVERS.inc()
+        self.take(opened)
+        return True
+
+    def take(self, opened: OpenReply) -> None:
+        """What the owner says of the session holds from here on."""
         self.mapper = opened.mapper
         self.epoch = opened.epoch
-        TAKEOVERS.inc()
         self.acknowledged_revision = opened.map_revision
         self.keyframes = opened.keyframe_poses
         if opened.last is not None:

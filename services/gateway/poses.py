@@ -66,6 +66,10 @@ class PoseRing:
         """Add the newest answer and the revision of the map it was made against."""
         self._entries.append((record, map_revision))
 
+    def clear(self) -> None:
+        """Forget all."""
+        self._entries.clear()
+
     def last(self, keyframes: KeyframePoses) -> TimedPose:
         """The newest answered frame; a LOST one has the last known pose.
 

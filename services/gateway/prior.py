@@ -68,7 +68,12 @@ def _motion(prior: Prior | None, result: TrackResult) -> np.ndarray:
 
 
 def resumed_prior(opened: OpenReply) -> Prior | None:
-    """The prior of a session taken up from its log: the last pose, without motion."""
+    """The prior of a session taken up from its log.
+
+    Of an older version's log it is the last pose, without motion.
+    """
+    if opened.prior is not None:
+        return opened.prior
     last, keyframes = opened.last, opened.keyframe_poses.seqs
     if last is None or len(keyframes) == 0:
         return None

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import logging
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from services.gateway.access.tenants import public_name
@@ -12,16 +15,27 @@ from services.gateway.delivery import Delivery
 from services.gateway.dispatch import Limits
 from services.gateway.errors import detail
 from services.gateway.frame_queue import FrameQueue, Outcome
+from services.gateway.frame_reply import reply_of
 from services.gateway.localizer import Localizer
 from services.gateway.owner import Fabric, MapOwner
-from services.gateway.poses import PoseRing, TimedPose, deviations, record_of
+from services.gateway.pose_feed import PoseFeed
+from services.gateway.poses import TimedPose, record_of
 from services.gateway.prior import next_prior, resumed_prior
-from shared.errors import PointSlamError
-from shared.frames import HAS_POSE, Frame, TrackRequest
+from shared.bus import Keys
+from shared.errors import ClaimLostError, PointSlamError, UnavailableError
+from shared.frames import Frame, TrackRequest
 from shared.localization import LocalizeMessage, LocalizeReply
-from shared.se3 import Pose
 from shared.stream import FrameMessage, FrameReply
-from shared.tracks import Advance, OpenReply, TrackResult
+from shared.tracks import (
+    Advance,
+    Advanced,
+    ClaimReply,
+    ClaimRequest,
+    OpenReply,
+    TrackResult,
+)
+
+LOGGER = logging.getLogger(__name__)
 
 
 class Session:
@@ -35,22 +49,76 @@ class Session:
         self.owner = MapOwner(fabric, opened)
         self._fabric = fabric
         self._T_world_first = opened.T_world_first
-        self._prior = resumed_prior(opened)
         self._delivery = Delivery(self.owner, fabric.config.mapping)
-        stream = fabric.config.stream
-        self._poses = PoseRing(stream.poses, stream.max_gap_s)
-        newest = (-1, -1)
-        if opened.last is not None:
-            newest = (opened.last.seq, opened.last.t_ns)
-            self._poses.add(opened.last, opened.map_revision)
+        self.poses = PoseFeed(fabric.config.stream)
         waiting = fabric.config.limits.max_waiting_frames
-        self._frames = FrameQueue(self._answer, self.is_live, waiting, newest)
-        self._newest = newest
+        self._frames = FrameQueue(self._answer, self.is_live, waiting)
         self._localizer = Localizer(fabric, self.owner, self.calibration)
-        self._watchers: set[asyncio.Queue[TimedPose]] = set()
+        self._users = 0
+        self._used_s = time.monotonic()
+        self._claim = 0  # the number of ours; 0 while another gateway may advance the session
+        self._claiming = asyncio.Lock()
+        self._take_up(opened)
+        self._unfollow = self._follow_owner()
+
+    async def claim(self) -> None:
+        """Make sure that this gateway is the one that advances the session.
+
+        If another one was in between, what this one remembers is renewed.
+
+        Raises:
+            UnavailableError: the map has no owner who could say so.
+        """
+        async with self._claiming:
+            wait_s = self._fabric.config.mapping.claim_wait_s if self._claim else None
+            try:
+                async with asyncio.timeout(wait_s):
+                    reply = await self._ask_claim()
+            except (TimeoutError, UnavailableError):
+                if self._claim == 0:
+                    raise
+                return  # nobody can claim it from an owner that is not there either
+            if reply.opened is not None:
+                self._lose_claim()
+                self.owner.take(reply.opened)
+                self._take_up(reply.opened)
+            self._claim = reply.number
+
+    async def _ask_claim(self) -> ClaimReply:
+        request = ClaimRequest(self._fabric.name, self._claim)
+        timeout_s = self._fabric.config.mapping.question_timeout_s
+        return await self.owner.ask("claim", request, ClaimReply, timeout_s)
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Keep this session open while the block runs."""
+        self._users += 1
+        try:
+            yield
+        finally:
+            self._users -= 1
+            self.touch()
+
+    def touch(self) -> None:
+        """Note that somebody asked for it."""
+        self._used_s = time.monotonic()
+
+    def is_idle(self, idle_s: float) -> bool:
+        """Whether nobody has used it for so long, and nothing is under way."""
+        is_busy = (
+            self._users or self.poses.is_watched or self._delivery or not self._frames.is_empty
+        )
+        return not is_busy and time.monotonic() - self._used_s > idle_s
 
     def submit(self, message: FrameMessage) -> asyncio.Future[Outcome]:
-        """Queue a checked frame; see `FrameQueue.submit` for what it raises."""
+        """Queue a checked frame.
+
+        Raises:
+            ClaimLostError: another gateway advances the session; `claim` it first.
+            PointSlamError: as `FrameQueue.submit`.
+        """
+        self._require_claim()
+        self.touch()
         return self._frames.submit(message)
 
     async def track(self, message: FrameMessage) -> FrameReply:
@@ -59,6 +127,14 @@ class Session:
         Raises:
             PointSlamError: the frame was refused.
         """
+        try:
+            return await self._track(message)
+        except ClaimLostError:  # single frames may come by any gateway, one after the other
+            return await self._track(message)
+
+    async def _track(self, message: FrameMessage) -> FrameReply:
+        if self._claim == 0:
+            await self.claim()
         outcome = await asyncio.shield(self.submit(message))
         if isinstance(outcome, PointSlamError):
             raise outcome
@@ -88,23 +164,19 @@ class Session:
         Raises:
             NotFoundError: there is none.
         """
-        if t_ns is None:
-            return self._poses.last(self.owner.keyframes)
-        return self._poses.at(t_ns, self.owner.keyframes)
+        return self.poses.pose(self.owner.keyframes, t_ns)
 
     def watch(self) -> asyncio.Queue[TimedPose]:
         """A queue that receives each new pose; a slow reader loses the oldest."""
-        queue: asyncio.Queue[TimedPose] = asyncio.Queue(maxsize=4)
-        self._watchers.add(queue)
-        return queue
+        return self.poses.watch()
 
     def unwatch(self, queue: asyncio.Queue[TimedPose]) -> None:
         """Stop a queue of `watch`."""
-        self._watchers.discard(queue)
+        self.poses.unwatch(queue)
 
     def state(self) -> dict[str, Any]:
         """The tracking side of the session as plain values."""
-        seq, t_ns = self._newest
+        seq, t_ns = self.poses.newest
         prior = self._prior
         return {
             "last_seq": seq,
@@ -121,27 +193,65 @@ class Session:
 
     def close(self) -> None:
         """Stop serving; the map stays with its owner."""
-        self._frames.close()
-        self._delivery.close()
+        self._frames.refuse(UnavailableError("the session was closed"))
+        self._delivery.give_up()
+        self._unfollow()
         self.owner.close()
         self._fabric.trackers.release(self.owner.session)
 
     async def _answer(self, message: FrameMessage, waited_ms: float) -> FrameReply:
+        self._require_claim()
         start = time.perf_counter()
         frame = message.frame()
         result = await self._ask_tracker(frame)
+        prior = next_prior(self._prior, frame, result)
         entry = Advance(
-            record_of(result), frame if result.keyframe is not None else None, result.keyframe
+            record_of(result),
+            frame if result.keyframe is not None else None,
+            result.keyframe,
+            claim=self._claim,
+            prior=prior,
         )
         await self._deliver(entry)
-        self._prior = next_prior(self._prior, frame, result)
-        self._newest = (frame.seq, frame.t_ns)
-        self._poses.add(entry.record, result.map_revision)
-        self._tell_watchers()
+        self._prior = prior
+        self.poses.add(entry.record, result.map_revision, self.owner.keyframes)
         total_ms = 1e3 * (time.perf_counter() - start)
-        reply = _reply(result, {"queue": waited_ms, "gateway": total_ms})
+        reply = reply_of(result, {"queue": waited_ms, "gateway": total_ms})
         problem = self._delivery.problem
         return reply if problem is None else dataclasses.replace(reply, map_problem=detail(problem))
+
+    def _take_up(self, opened: OpenReply) -> None:
+        """Remember what the owner knows, and nothing else."""
+        self._prior = resumed_prior(opened)
+        self.poses.reset(opened.last, opened.map_revision)
+        self._frames.resume(self.poses.newest)
+
+    def _follow_owner(self) -> Callable[[], None]:
+        """Hear of frames that other gateways' clients send, and of claims."""
+        loop = asyncio.get_running_loop()
+
+        def heard(news: Advanced) -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(self._follow, news)
+
+        return self._fabric.bus.subscribe(Keys.advanced(self.owner.session), Advanced, heard)
+
+    def _follow(self, news: Advanced) -> None:
+        if news.claim > self._claim > 0:
+            self._lose_claim()
+        if self._claim == 0 and news.record is not None:
+            self.poses.add(news.record, news.map_revision, self.owner.keyframes)
+
+    def _lose_claim(self) -> None:
+        if self._claim > 0:
+            LOGGER.info("%s: advanced by another gateway now", self.name)
+        self._claim = 0
+        self._frames.refuse(_claim_lost(self.name))
+        self._delivery.give_up()
+
+    def _require_claim(self) -> None:
+        if self._claim == 0:
+            raise _claim_lost(self.name)
 
     async def _ask_tracker(self, frame: Frame) -> TrackResult:
         dispatch = self._fabric.config.dispatch
@@ -170,6 +280,13 @@ class Session:
         )
 
     async def _deliver(self, entry: Advance) -> None:
+        try:
+            await self._hand_over(entry)
+        except ClaimLostError:
+            self._claim = 0
+            raise
+
+    async def _hand_over(self, entry: Advance) -> None:
         if not self.is_live:
             await self.owner.advance(entry)
             return
@@ -178,26 +295,6 @@ class Session:
             # Trackers ask for the neighbourhood of this keyframe with the next frame.
             await self._delivery.settle(self._fabric.config.mapping.keyframe_wait_s)
 
-    def _tell_watchers(self) -> None:
-        for queue in self._watchers:
-            if queue.full():
-                queue.get_nowait()
-            queue.put_nowait(self.pose())
 
-
-def _reply(result: TrackResult, times_ms: dict[str, float]) -> FrameReply:
-    deviation = deviations(result.covariance) if result.status in HAS_POSE else None
-    return FrameReply(
-        seq=result.seq,
-        t_ns=result.t_ns,
-        status=result.status,
-        T_map_camera=Pose.from_matrix(result.T_world_camera),
-        pos_std_m=deviation[0] if deviation else None,
-        rot_std_deg=deviation[1] if deviation else None,
-        inliers=result.inliers,
-        inlier_share=result.inlier_share,
-        reference_seq=result.reference_seq,
-        map_revision=result.map_revision,
-        keyframe=result.keyframe is not None,
-        timings_ms=result.timings_ms | times_ms,
-    )
+def _claim_lost(session: str) -> ClaimLostError:
+    return ClaimLostError(f"another gateway advances session {session}: go on there, or reconnect")

@@ -105,12 +105,22 @@ class Sessions:
             UnavailableError: no mapper could take it up in time.
         """
         name = full_name(name)
-        if name in self._open:
-            return self._open[name]
-        async with self._lock_of(name):
-            if name not in self._open:
-                self._open[name] = Session(self.fabric, await self._resume(name))
-        return self._open[name]
+        if name not in self._open:
+            async with self._lock_of(name):
+                if name not in self._open:
+                    self._open[name] = Session(self.fabric, await self._resume(name))
+        session = self._open[name]
+        session.touch()
+        return session
+
+    async def forget_idle(self) -> None:
+        """Keep memory bounded, for ever: what nobody uses is closed; `get` takes it up again."""
+        idle_s = self.fabric.config.session_idle_s
+        while True:
+            await asyncio.sleep(min(idle_s / 4, 15.0))
+            for name, session in list(self._open.items()):
+                if session.is_idle(idle_s):
+                    self._open.pop(name).close()
 
     async def list(self) -> list[dict[str, Any]]:
         """Every session of the caller's tenant on the live mappers, newest first."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import InputError
+from shared.frames import Prior
 from shared.tracks import Advance, FrameRecord, KeyframeData
 
 _FURTHEST_M = 10_000.0  # voxels of a map are numbered that far
@@ -25,6 +26,8 @@ def check_entry(entry: Advance) -> None:
     if entry.frame is not None and entry.frame.seq != entry.record.seq:
         raise InputError("frame.seq", f"is {entry.frame.seq}, the record's is {entry.record.seq}")
     _check_shapes("record", _shapes_of_record(entry.record))
+    if entry.prior is not None:
+        _check_shapes("prior", _shapes_of_prior(entry.prior))
     if entry.keyframe is not None:
         _check_shapes("keyframe", _shapes_of_keyframe(entry.keyframe))
 
@@ -56,6 +59,14 @@ def _shapes_of_record(record: FrameRecord) -> _Shaped:
         "T_world_camera": (record.T_world_camera, (4, 4)),
         "covariance": (record.covariance, (6, 6)),
     }
+
+
+def _shapes_of_prior(prior: Prior) -> _Shaped:
+    T_reference_camera = prior.T_reference_camera
+    return {
+        "T_world_camera": (prior.T_world_camera, (4, 4)),
+        "T_before_last": (prior.T_before_last, (4, 4)),
+    } | ({} if T_reference_camera is None else {"T_reference_camera": (T_reference_camera, (4, 4))})
 
 
 def _shapes_of_keyframe(data: KeyframeData) -> _Shaped:

@@ -49,8 +49,8 @@ from shared.maps import (
 from shared.tracks import (
     Advance,
     CandidatesRequest,
+    ClaimRequest,
     ContextRequest,
-    KeyframePoses,
     OpenReply,
     OpenRequest,
 )
@@ -227,7 +227,9 @@ class MapperHost:
         settings = self._settings
         if len(self._served) >= settings.config.owner.max_sessions:
             raise UnavailableError(f"mapper {settings.name} has {len(self._served)} sessions open")
-        surroundings = Surroundings(settings.name, settings.config, settings.device, self._publish)
+        surroundings = Surroundings(
+            settings.name, settings.config, settings.device, self._bus.publish
+        )
         try:
             folder, lease = self._claim(request)
             session = Session(folder, lease, surroundings)
@@ -249,9 +251,6 @@ class MapperHost:
             session.ledger.num_keyframes,
         )
         return served
-
-    def _publish(self, session: str, poses: KeyframePoses) -> None:
-        self._bus.publish(Keys.revisions(session), poses)
 
     def _summary(self, folder: Path) -> SessionSummary | None:
         """None for a damaged session: it must not hide the others."""
@@ -276,6 +275,7 @@ def _answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]
     """The questions of `Keys.session`, with what they carry and who answers."""
     ledger = session.ledger
     return [
+        ("claim", ClaimRequest, session.claim),
         ("advance", Advance, session.advance),
         ("context", ContextRequest, ledger.context),
         ("candidates", CandidatesRequest, ledger.candidates),

@@ -18,7 +18,7 @@ from services.mapping.pipeline import NewKeyframe
 from services.mapping.snapshot import read_newest
 from services.mapping.storage import SessionFolder, SessionRecord
 from shared.errors import ConflictError
-from shared.frames import Frame
+from shared.frames import Frame, Prior
 from shared.maps import JobStatus, Trajectory
 from shared.tracks import (
     Advance,
@@ -57,6 +57,7 @@ class Ledger:
     ) -> None:
         self._lock = threading.Lock()
         self._records = FrameRecords()
+        self.prior: Prior | None = None  # what the next frame starts from
         self._store = KeyframeStore(config)
         self._context: TrackingContext | None = None  # the last one asked for
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="context")
@@ -75,7 +76,7 @@ class Ledger:
         for name in sorted(log_ends):
             for entry in read_log(folder.path / name, log_ends[name]):
                 if snapshot and len(self._records) < snapshot.entries:
-                    self._records.append(entry.record)
+                    self._note(entry)
                     if entry.frame is not None:
                         resumed.frames[entry.frame.seq] = entry.frame
                 else:
@@ -142,12 +143,16 @@ class Ledger:
 
     def _apply(self, entry: Advance) -> NewKeyframe | None:
         record = entry.record
-        self._records.append(record)
+        self._note(entry)
         if entry.frame is None or entry.keyframe is None:
             return None
         self._store.insert(record.seq, record.t_ns, record.T_world_camera, entry.keyframe)
         _, landmarks_world = self._store.landmarks_seen_by(record.seq)
         return NewKeyframe(entry.frame, self._store.poses(), landmarks_world)
+
+    def _note(self, entry: Advance) -> None:
+        self._records.append(entry.record)
+        self.prior = entry.prior
 
     def poses(self) -> KeyframePoses:
         """Present poses of all keyframes."""

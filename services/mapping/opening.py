@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 
+from services.mapping.ledger import Ledger
 from services.mapping.storage import SessionRecord
 from services.mapping.worker import LIVE, OFFLINE
 from shared import codec
 from shared.errors import ConflictError, InputError, NotFoundError
-from shared.tracks import OpenRequest
+from shared.tracks import OpenReply, OpenRequest
 
 
 def new_record(request: OpenRequest) -> SessionRecord:
@@ -43,3 +44,20 @@ def check_same(record: SessionRecord, request: OpenRequest) -> None:
     again = (request.mode, request.seed, codec.pack(request.calibration))
     if again != (record.mode, record.seed, codec.pack(record.calibration)):
         raise ConflictError(f"session {request.session} exists with other settings")
+
+
+def opening_of(record: SessionRecord, mapper: str, ledger: Ledger) -> OpenReply:
+    """What whoever opens or claims a session is told of it."""
+    return OpenReply(
+        session=record.session,
+        mapper=mapper,
+        epoch=record.epoch,
+        mode=record.mode,
+        map_revision=ledger.revision,
+        created_ns=record.created_ns,
+        calibration=record.calibration,
+        T_world_first=record.T_world_first,
+        last=ledger.last,
+        prior=ledger.prior,
+        keyframe_poses=ledger.poses(),
+    )

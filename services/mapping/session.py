@@ -11,6 +11,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
+from services.mapping.claims import Claims
 from services.mapping.config import MappingConfig
 from services.mapping.export import pack_folder, spooled
 from services.mapping.exports import Exports
@@ -18,6 +19,7 @@ from services.mapping.figures import MapFigures
 from services.mapping.ledger import Ledger, Resumed
 from services.mapping.map_files import write_map
 from services.mapping.metrics import SNAPSHOT_SECONDS
+from services.mapping.opening import opening_of
 from services.mapping.pipeline import Mapper
 from services.mapping.refinement import Refinement
 from services.mapping.renders import Renders
@@ -25,6 +27,7 @@ from services.mapping.snapshot import Snapshot, write_snapshot
 from services.mapping.storage import SessionFolder
 from services.mapping.tenure import Lease
 from services.mapping.worker import MapWorker
+from shared.bus import Keys
 from shared.errors import ConfigError, InputError, PointSlamError
 from shared.maps import (
     ExportChunk,
@@ -37,7 +40,16 @@ from shared.maps import (
     RenderRequest,
     SaveReply,
 )
-from shared.tracks import Advance, AdvanceReply, KeyframePoses, OpenReply
+from shared.tracks import (
+    Advance,
+    Advanced,
+    AdvanceReply,
+    ClaimReply,
+    ClaimRequest,
+    FrameRecord,
+    KeyframePoses,
+    OpenReply,
+)
 
 LOGGER = logging.getLogger(__name__)
 
@@ -49,7 +61,7 @@ class Surroundings:
     mapper: str  # the process's name
     config: MappingConfig
     device: torch.device
-    publish: Callable[[str, KeyframePoses], None]  # session, poses
+    publish: Callable[[str, KeyframePoses | Advanced], None]  # key, news
 
 
 class Session:
@@ -61,6 +73,7 @@ class Session:
         self._surroundings = surroundings
         config = surroundings.config
         self.record = folder.take_up(lease.epoch)
+        self._claims = Claims(folder, self.record)
         self.ledger = Ledger(folder, self.record, config.keyframes)
         self._exports = Exports(config.owner.chunk_bytes)
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
@@ -102,19 +115,21 @@ class Session:
 
     def opening(self) -> OpenReply:
         """What whoever opens the session is told."""
-        record = self.record
-        return OpenReply(
-            session=record.session,
-            mapper=self._surroundings.mapper,
-            epoch=record.epoch,
-            mode=record.mode,
-            map_revision=self.ledger.revision,
-            created_ns=record.created_ns,
-            calibration=record.calibration,
-            T_world_first=record.T_world_first,
-            last=self.ledger.last,
-            keyframe_poses=self.ledger.poses(),
-        )
+        return opening_of(self.record, self._surroundings.mapper, self.ledger)
+
+    def claim(self, request: ClaimRequest) -> ClaimReply:
+        """Let one gateway, and no other, advance the session from here.
+
+        Raises:
+            SteppedDownError: another mapper may own the session by now.
+            StorageError: the disk refused.
+        """
+        with self._calm:
+            self._lease.check()
+            if not self._claims.take(request):
+                return ClaimReply(request.held, None)
+            self._tell(None)
+            return ClaimReply(self._claims.newest, self.opening())
 
     def advance(self, entry: Advance) -> AdvanceReply:
         """Log an answered frame; its keyframe is in contexts and on disk when this returns.
@@ -123,19 +138,27 @@ class Session:
         frame that was appended before is acknowledged again.
 
         Raises:
+            ClaimLostError: another gateway has claimed the session since.
             InputError, ConflictError, StorageError: as `Ledger.append`.
             SteppedDownError: another mapper may own the session by now; nothing is acknowledged.
         """
         with self._calm:
             self._lease.check()
+            self._claims.check(entry.claim)
             if not self.ledger.holds(entry.record.seq):
                 keyframe = self.ledger.append(entry)
                 self._worker.submit(keyframe)
                 if keyframe is not None:
-                    self._surroundings.publish(self.record.session, keyframe.poses)
+                    key = Keys.revisions(self.record.session)
+                    self._surroundings.publish(key, keyframe.poses)
+                self._tell(entry.record)
             self._lease.check()  # this process may have been frozen before or while it wrote
         self._worker.wait_for_room()
         return AdvanceReply(entry.record.seq, self.ledger.revision)
+
+    def _tell(self, record: FrameRecord | None) -> None:
+        news = Advanced(self._claims.newest, self.ledger.revision, record)
+        self._surroundings.publish(Keys.advanced(self.record.session), news)
 
     def render(self, request: RenderRequest) -> RenderReply:
         """A view of the map, with how well it is known; may be a kept one (`render_cache`).

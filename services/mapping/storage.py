@@ -33,6 +33,7 @@ class SessionRecord:
     created_ns: int
     calibration: Calibration
     T_world_first: NDArray[np.float64]  # [4, 4]
+    claim: int = 0  # of the gateway that advances the session; grows with every change of it
     log_ends: dict[str, int] = field(default_factory=dict)  # bytes of each older epoch's log
 
 

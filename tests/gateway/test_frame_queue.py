@@ -142,7 +142,7 @@ def test_a_closed_queue_refuses_what_waits():
     async def run():
         queue = offline(Answers())
         future = queue.submit(message(0))
-        queue.close()
+        queue.refuse(UnavailableError("the session was closed"))
         return await future
 
     assert isinstance(asyncio.run(run()), UnavailableError)

@@ -16,10 +16,17 @@ from services.mapping.config import MappingConfig, OwnerConfig
 from services.mapping.session import Session, Surroundings
 from services.mapping.storage import SessionFolder, SessionRecord, read_record
 from services.mapping.tenure import Lease
-from shared import se3
-from shared.errors import ConflictError, GoneError, InputError, UnavailableError
+from shared import codec, se3
+from shared.errors import (
+    ClaimLostError,
+    ConflictError,
+    GoneError,
+    InputError,
+    UnavailableError,
+)
+from shared.frames import Prior
 from shared.maps import ExportFormat, ExportRequest, JobState, RefineRequest, RenderRequest
-from shared.tracks import ContextRequest
+from shared.tracks import Advanced, ClaimReply, ClaimRequest, ContextRequest, KeyframePoses
 
 CONFIG = MappingConfig(owner=OwnerConfig(max_pending=2))
 
@@ -38,7 +45,7 @@ def published():
 def open_session(tmp_path, record, published):
     """Opens the session at a path, creating it the first time; closes all at the end."""
     surroundings = Surroundings(
-        "m0", CONFIG, torch.device("cpu"), lambda session, poses: published.append(poses)
+        "m0", CONFIG, torch.device("cpu"), lambda key, news: published.append(news)
     )
     opened = []
     epochs: dict[Path, int] = {}
@@ -121,7 +128,7 @@ def test_every_revision_is_published(open_session, entry, published):
     for seq in range(5):
         session.advance(entry(seq))
 
-    assert [poses.revision for poses in published] == [1, 2]
+    assert [news.revision for news in published if isinstance(news, KeyframePoses)] == [1, 2]
 
 
 def test_two_runs_with_one_seed_give_the_same_map_to_the_bit(open_session, entry):
@@ -356,3 +363,45 @@ def test_the_exported_folder_is_a_session_again(open_session, entry, tmp_path):
     resumed = open_session("elsewhere/room")
 
     assert resumed.ledger.num_keyframes == 1
+
+
+def test_frames_of_an_older_claim_are_refused_and_leave_no_trace(open_session, entry):
+    session = open_session()
+    old = session.claim(ClaimRequest("a")).number
+    new = session.claim(ClaimRequest("b")).number
+    session.advance(replace(entry(0), claim=new))
+
+    with pytest.raises(ClaimLostError):
+        session.advance(replace(entry(1), claim=old))
+
+    assert session.ledger.entries == 1
+
+
+def test_who_has_the_newest_claim_keeps_it_by_asking_again(open_session):
+    session = open_session()
+    held = session.claim(ClaimRequest("a")).number
+
+    assert session.claim(ClaimRequest("a", held)) == ClaimReply(held, None)
+
+
+def test_a_claim_and_what_the_next_frame_starts_from_outlive_the_process(open_session, entry):
+    session = open_session()
+    claim = session.claim(ClaimRequest("a")).number
+    T = np.eye(4)
+    prior = Prior(0, 1, T, T, 7, 0, 0, 0, 3, frame_digest=5)
+    session.advance(replace(entry(0), claim=claim, prior=prior))
+
+    again = open_session()
+
+    assert codec.pack(again.opening().prior) == codec.pack(prior)
+    with pytest.raises(ClaimLostError):
+        again.advance(entry(1))
+
+
+def test_a_new_claim_is_published_and_so_is_each_frame(open_session, entry, published):
+    session = open_session()
+    claim = session.claim(ClaimRequest("a")).number
+    session.advance(replace(entry(0), claim=claim))
+
+    news = [each for each in published if isinstance(each, Advanced)]
+    assert [(each.claim, each.record is not None) for each in news] == [(1, False), (1, True)]

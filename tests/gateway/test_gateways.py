@@ -1,0 +1,143 @@
+"""Several gateways before the same sessions: real processes, clients that move between them."""
+
+import threading
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from benchmarks.local_gateway import free_port, gateway_process, local_gateway
+from pointslam.client import Client
+from shared.bus import Keys, open_bus
+from shared.errors import ClaimLostError
+from shared.tracks import AdvanceReply, ClaimReply, ClaimRequest
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def gateways():
+    """One router, two trackers, one mapper; clients of two gateways."""
+    with ExitStack() as stack:
+        first = stack.enter_context(local_gateway(2))
+        ports = (free_port(), free_port())
+        settings = ("session_idle_s=1.0",)
+        stack.enter_context(gateway_process(first.router, ports, *settings))
+        clients = [
+            stack.enter_context(Client(url)) for url in (first.url, f"http://127.0.0.1:{ports[0]}")
+        ]
+        for client in clients:
+            while not client.ready():
+                time.sleep(0.02)
+        yield first, clients
+
+
+def priors(gateway, session):
+    """What the trackers were told of the last pose, by frame number."""
+    asked = [r for t in gateway.trackers for r in t.requests if r.session == session]
+    return {r.frame.seq: r.prior for r in asked}
+
+
+def stream(session, rgb, depth, seqs):
+    session.next_seq = seqs[0]
+    frames = [session.frame(rgb, depth, (seq + 1) * SECOND) for seq in seqs]
+    return list(session.stream(frames))
+
+
+@pytest.mark.parametrize("mode", ["offline", "live"])
+def test_a_session_goes_there_and_back_and_no_gateway_works_from_what_is_stale(
+    gateways, calibration, rgb, depth, mode
+):
+    gateway, (here, there) = gateways
+    session = here.create_session(calibration, mode=mode)
+    same = there.session(session.name)
+
+    replies = []
+    for client_session, seqs in ((session, [0, 1]), (same, [2, 3]), (session, [4, 5])):
+        for seq in seqs:
+            replies += stream(client_session, rgb, depth, [seq])
+
+    assert [reply.error for reply in replies] == [None] * 6
+    known = priors(gateway, session.name)
+    assert [known[seq].seq for seq in range(1, 6)] == [0, 1, 2, 3, 4]
+    session.wait_until_mapped()
+    assert [record.seq for record in session.trajectory()] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_frame_elsewhere_starts_from_the_very_prior_that_it_would_have_had(
+    gateways, calibration, rgb, depth
+):
+    gateway, (here, there) = gateways
+    moving, staying = (here.create_session(calibration, mode="offline") for _ in range(2))
+
+    for seq in range(4):
+        client = (here, there)[seq % 2]
+        session = client.session(moving.name)
+        session.track(rgb, depth, (seq + 1) * SECOND)
+        staying.track(rgb, depth, (seq + 1) * SECOND)
+
+    moved, stayed = priors(gateway, moving.name)[3], priors(gateway, staying.name)[3]
+    np.testing.assert_array_equal(moved.T_before_last, stayed.T_before_last)
+    assert moved.frame_digest == stayed.frame_digest is not None
+    assert (moved.seq, moved.before_last_dt_ns) == (stayed.seq, stayed.before_last_dt_ns)
+
+
+def test_a_stream_whose_session_went_elsewhere_is_told_so(gateways, calibration, rgb, depth):
+    _, (here, there) = gateways
+    session = here.create_session(calibration, mode="offline")
+    went = threading.Event()
+
+    def frames():
+        yield session.frame(rgb, depth, SECOND)
+        went.wait(10.0)
+        yield session.frame(rgb, depth, 3 * SECOND)
+
+    replies = session.stream(frames())
+    first = next(replies)
+    there.session(session.name).track(rgb, depth, 2 * SECOND)
+    went.set()
+
+    assert first.error is None
+    assert [reply.error.code for reply in replies] == ["claim_lost"]
+
+
+def test_poses_are_heard_of_at_every_gateway(gateways, calibration, rgb, depth):
+    _, (here, there) = gateways
+    session = here.create_session(calibration, mode="live")
+    elsewhere = there.session(session.name)
+
+    for seq in range(3):
+        session.track(rgb, depth, (seq + 1) * SECOND)
+
+    deadline = time.monotonic() + 5.0
+    while elsewhere.info()["tracking"]["last_seq"] < 2:
+        assert time.monotonic() < deadline
+    np.testing.assert_allclose(elsewhere.pose()[0, 3], 0.02, atol=1e-12)
+
+
+def test_a_session_that_nobody_uses_is_taken_up_again_as_it_was(gateways, calibration, rgb, depth):
+    gateway, (_, there) = gateways  # this gateway forgets after a second
+    session = there.create_session(calibration, mode="offline")
+    for seq in range(2):
+        session.track(rgb, depth, (seq + 1) * SECOND)
+
+    time.sleep(1.6)
+    session.track(rgb, depth, 3 * SECOND)
+
+    assert priors(gateway, session.name)[2].seq == 1
+
+
+def test_the_owner_takes_frames_of_the_newest_claim_only(gateways, calibration, rgb, depth):
+    gateway, (here, _) = gateways
+    session = here.create_session(calibration, mode="offline")
+    session.track(rgb, depth, SECOND)
+    entry = gateway.mapper.disk[session.name].entries[-1]
+    with open_bus([gateway.router]) as bus:
+        key = Keys.session(session.name, 1, "claim")
+        claim = bus.query(key, ClaimRequest("other"), ClaimReply, 5.0)
+
+        with pytest.raises(ClaimLostError):
+            bus.query(Keys.session(session.name, 1, "advance"), entry, AdvanceReply, 5.0)
+
+    assert claim.number == entry.claim + 1
