@@ -83,7 +83,8 @@ def test_nobody_waits_for_an_owner_that_is_lost():
         delivery = to_owner(advance, lost)
         await delivery.put(entry(0))
         await asyncio.wait_for(delivery.settle(60.0), 10.0)
-        delivery.close()
-        return str(delivery.problem)
+        problem = delivery.problem
+        delivery.give_up()
+        return str(problem)
 
     assert "no owner" in asyncio.run(run())
