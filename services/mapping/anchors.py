@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from services.mapping.config import AnchorConfig
+from services.mapping.quaternions import product, quat_wxyz_of
 from services.mapping.rows import RowTable
 from services.mapping.voxels import level_of, voxel_keys
 from shared import se3
 
 FEATURES = 32
+IDENTITY = torch.tensor([1.0, 0.0, 0.0, 0.0])  # a quaternion, wxyz
 
 
 def trained_widths(config: AnchorConfig) -> dict[str, int]:
@@ -76,7 +78,7 @@ class AnchorMap:
     @property
     def num_bytes(self) -> int:
         """Size of the map itself, without optimizer state."""
-        widths = {"position": 3, "scalings": 6} | trained_widths(self.config)
+        widths = {"position": 3, "turn": 4, "scalings": 6} | trained_widths(self.config)
         return len(self) * 4 * sum(widths.values())
 
     def keys(self) -> NDArray[np.int64]:
@@ -118,6 +120,7 @@ class AnchorMap:
                 "gate": torch.ones(len(new)),
                 "rate": torch.where(is_primary, self.config.primary_rate, 1.0),
                 "creator": torch.full((len(new),), creator_seq, dtype=torch.int64),
+                "turn": IDENTITY.expand(len(new), 4),
             }
         )
         return len(new)
@@ -129,8 +132,8 @@ class AnchorMap:
     def move(self, creator_seq: int, T_new_old: NDArray[np.float64]) -> None:
         """Take the anchors of a keyframe along with its correction.
 
-        Positions and offsets turn with the keyframe. The networks' quaternions cannot, but the
-        angles of corrections are small and the next iterations see to the rest.
+        Positions and offsets turn with the keyframe. What the networks say of an anchor is said
+        in a frame that turns with it, too: `turn` is that frame in the world.
         """
         index = torch.nonzero(self.rows["creator"] == creator_seq)[:, 0]
         R = torch.from_numpy(T_new_old[:3, :3]).to(self.rows["position"])
@@ -143,10 +146,12 @@ class AnchorMap:
         sizes = self.rows["scalings"][index, None, :3].exp()
         offsets = self.rows["offsets"][index].view(-1, self.config.children, 3) * sizes
         self.rows["offsets"][index] = ((offsets @ R.T) / sizes).flatten(1)
+        turn = product(quat_wxyz_of(T_new_old).to(self.device), self.rows["turn"][index])
+        self.rows["turn"][index] = torch.nn.functional.normalize(turn, dim=1)
 
     def copy(self) -> AnchorMap:
         """What drawing needs of them, as it is now; without optimizer state and statistics."""
-        drawn = {"position", "scalings", "creator", "gate", *trained_widths(self.config)}
+        drawn = {"position", "turn", "scalings", "creator", "gate", *trained_widths(self.config)}
         copied = AnchorMap(self.config, self.device, self.is_gated)
         copied.rows = self.rows.copy(drawn)
         return copied
@@ -156,8 +161,9 @@ class AnchorMap:
         return self.rows.state(room)
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Replace all rows."""
-        self.rows.restore(state)
+        """Replace all rows; those of an older snapshot have never been turned."""
+        count = len(state["position"])
+        self.rows.restore({"turn": IDENTITY.expand(count, 4), **state})
 
 
 def _columns(config: AnchorConfig) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
@@ -171,6 +177,7 @@ def _columns(config: AnchorConfig) -> dict[str, tuple[tuple[int, ...], torch.dty
         "scalings": ((6,), torch.float32),
         **trained,
         "position": ((3,), torch.float32),
+        "turn": ((4,), torch.float32),
         "steps": ((), torch.int64),
         "rate": ((), torch.float32),
         "is_primary": ((), torch.bool),

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from services.mapping.anchors import FEATURES, AnchorMap, trained_widths
 from services.mapping.config import AnchorConfig, DecoderConfig, LearningRates
+from services.mapping.quaternions import product, rotate_back
 from services.mapping.rasterizer import Gaussians
 from services.mapping.weight_adam import WeightAdam
 
@@ -42,6 +43,7 @@ class VisibleAnchors:
 
     index: Tensor  # [V], rows of the map
     positions: Tensor  # [V, 3]
+    turns: Tensor  # [V, 4], unit quaternions wxyz: how anchors were turned since they came
     features: Tensor  # [V, 32]
     offsets: Tensor  # [V, k * 3]
     scalings: Tensor  # [V, 6]
@@ -54,7 +56,7 @@ class VisibleAnchors:
             name: rows[name][index].requires_grad_(is_trained)
             for name in trained_widths(anchors.config)
         }
-        return VisibleAnchors(index, rows["position"][index], **trained)
+        return VisibleAnchors(index, rows["position"][index], rows["turn"][index], **trained)
 
 
 def initial_weights(anchors: AnchorConfig, decoder: DecoderConfig, seed: int) -> Weights:
@@ -109,11 +111,12 @@ def decode(
     sizes = visible.scalings[:, None].exp()
     shares = torch.sigmoid(covariance[:, : 3 * k]).view(-1, k, 3)
     means = visible.positions[:, None] + visible.offsets.view(-1, k, 3) * sizes[..., :3]  # Eq. 5
-    quats = covariance[:, 3 * k :].reshape(-1, 4) + covariance.new_tensor([1.0, 0.0, 0.0, 0.0])
+    own = covariance[:, 3 * k :].view(-1, k, 4) + covariance.new_tensor([1.0, 0.0, 0.0, 0.0])
+    quats = product(visible.turns[:, None], own)
     return Gaussians(
         means=means.reshape(-1, 3),
         scales=(shares * sizes[..., 3:]).reshape(-1, 3),
-        quats_wxyz=quats,
+        quats_wxyz=quats.reshape(-1, 4),
         opacities=opacities.clamp_min(0.0).reshape(-1),
         colours=colours.reshape(-1, 3),
     )
@@ -122,6 +125,7 @@ def decode(
 def _hidden(visible: VisibleAnchors, camera_world: Tensor, weights: Mapping[str, Tensor]) -> Tensor:
     direction = visible.positions - camera_world
     distance = direction.norm(dim=1, keepdim=True)
-    view = [direction / distance.clamp_min(1e-6), distance * DISTANCE_SCALE]
+    direction = rotate_back(visible.turns, direction / distance.clamp_min(1e-6))
+    view = [direction, distance * DISTANCE_SCALE]
     inputs = torch.cat([visible.features, *view], 1)
     return torch.relu(inputs @ weights["hidden_weight"] + weights["hidden_bias"])

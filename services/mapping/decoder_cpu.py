@@ -37,6 +37,7 @@ def decode_cpu(
     """The same as `decoder.decode`; results do not depend on the number of threads."""
     outputs = _Decode.apply(
         visible.positions,
+        visible.turns,
         camera_world,
         visible.features,
         visible.offsets,
@@ -47,12 +48,12 @@ def decode_cpu(
 
 
 class _Decode(torch.autograd.Function):
-    """(positions, camera, features, offsets, scalings, weights) -> the Gaussians' columns."""
+    """(positions, turns, camera, features, offsets, scalings, weights) -> Gaussians' columns."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore
-        positions, camera, features, offsets, scalings, *matrices = map(_flat, tensors)
-        rows = AnchorRows(positions, features, offsets, scalings)
+        positions, turns, camera, *others = map(_flat, tensors)
+        rows, matrices = AnchorRows(positions, turns, *others[:3]), others[3:]
         networks = Networks(*matrices)
         count, hidden = len(positions) // 3, len(networks.hidden_bias) // 3
         shape = Shape(count, len(networks.opacity_bias), hidden)
@@ -69,17 +70,17 @@ class _Decode(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
         rows, _, networks, shape = ctx.scene
-        down = AnchorRows(rows.positions, *(scratch().borrow(column.size) for column in rows[1:]))
+        down = AnchorRows(*rows[:2], *(scratch().borrow(column.size) for column in rows[2:]))
         chunks = -(-shape.anchors // COLUMNS)
         slopes = Networks(*(np.empty((chunks, w.size), np.float32) for w in networks))
         passed = ctx.out, Children(*map(_flat, gradients)), down, slopes
         _run(decode_chunks_backward, ctx.scene, passed)
-        trained = (column.reshape(shape.anchors, -1) for column in down[1:])
+        trained = (column.reshape(shape.anchors, -1) for column in down[2:])
         sums = (
             slope.sum(0, dtype=np.float64).astype(np.float32).reshape(size)
             for slope, size in zip(slopes, _sizes(shape), strict=True)
         )
-        return (None, None, *map(torch.from_numpy, trained), *map(torch.from_numpy, sums))
+        return (None, None, None, *map(torch.from_numpy, trained), *map(torch.from_numpy, sums))
 
 
 def _flat(tensor: Tensor) -> Array:

@@ -42,6 +42,7 @@ class AnchorRows(NamedTuple):
     """Columns of the visible anchors, or the gradients at them, one axis each."""
 
     positions: Array  # V * 3
+    turns: Array  # V * 4
     features: Array  # V * 32
     offsets: Array  # V * 3k
     scalings: Array  # V * 6
@@ -109,13 +110,50 @@ def read_inputs(rows, camera, start, count, planes):
         z = rows.positions[p + 2] - camera[2]
         distance = np.sqrt(x * x + y * y + z * z)
         inverse = _ONE / max(distance, _NEAR)
-        planes[FEATURES * STRIDE + n] = x * inverse
-        planes[(FEATURES + 1) * STRIDE + n] = y * inverse
-        planes[(FEATURES + 2) * STRIDE + n] = z * inverse
+        direction = _rotated_back(turn_of(rows, start + n), (x * inverse, y * inverse, z * inverse))
+        for axis in range(3):
+            planes[(FEATURES + axis) * STRIDE + n] = direction[axis]
         planes[(FEATURES + 3) * STRIDE + n] = distance * _SCALE
     for c in range(INPUTS):
         for n in range(count, COLUMNS):
             planes[c * STRIDE + n] = _ZERO
+
+
+@inlined
+def turn_of(rows, anchor):
+    """How an anchor was turned since it came: a unit quaternion."""
+    q = anchor * 4
+    return rows.turns[q], rows.turns[q + 1], rows.turns[q + 2], rows.turns[q + 3]
+
+
+@inlined
+def _rotated_back(turn, vector):
+    """`quaternions.rotate_back` of one vector."""
+    w, i, j, k = turn
+    x, y, z = vector
+    across_x, across_y, across_z = (
+        _TWO * (j * z - k * y),
+        _TWO * (k * x - i * z),
+        _TWO * (i * y - j * x),
+    )
+    return (
+        x - w * across_x + (j * across_z - k * across_y),
+        y - w * across_y + (k * across_x - i * across_z),
+        z - w * across_z + (i * across_y - j * across_x),
+    )
+
+
+@inlined
+def quat_product(first, second):
+    """`quaternions.product` of two quaternions."""
+    a, b, c, d = first
+    w, x, y, z = second
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
 
 
 @inlined
@@ -185,10 +223,14 @@ def _write_children(rows, shape, part, planes, out):
             out.colours[child] = planes[(colour + j) * STRIDE + n]
         for j in range(k):
             out.opacities[a * k + j] = planes[(opacity + j) * STRIDE + n]
-        for j in range(4 * k):
-            turn = _ONE if j % 4 == 0 else _ZERO
-            quat = planes[(covariance + 3 * k + j) * STRIDE + n]
-            out.quats[a * 4 * k + j] = quat + turn
+        turn = turn_of(rows, a)
+        for j in range(k):
+            plane, q = covariance + 3 * k + 4 * j, (a * k + j) * 4
+            x, y = planes[(plane + 1) * STRIDE + n], planes[(plane + 2) * STRIDE + n]
+            own = planes[plane * STRIDE + n] + _ONE, x, y, planes[(plane + 3) * STRIDE + n]
+            turned = quat_product(turn, own)
+            for c in range(4):
+                out.quats[q + c] = turned[c]
 
 
 @inlined

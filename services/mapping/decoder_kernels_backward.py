@@ -14,8 +14,10 @@ from services.mapping.decoder_kernels import (
     head_planes,
     hidden_layer,
     num_planes,
+    quat_product,
     read_inputs,
     sizes_of,
+    turn_of,
 )
 from services.mapping.lane_products import (
     COLUMNS,
@@ -93,8 +95,18 @@ def _heads_backward(rows, shape, part, passed, planes):
             share = scale * (_ONE - scale / sizes[3 + j % 3])
             planes[(colour + j) * STRIDE + n] = upstream.colours[child] * value * (_ONE - value)
             planes[(covariance + j) * STRIDE + n] = upstream.scales[child] * share
-        for j in range(4 * k):
-            planes[(covariance + 3 * k + j) * STRIDE + n] = upstream.quats[a * 4 * k + j]
+        w, x, y, z = turn_of(rows, a)
+        for j in range(k):
+            q = (a * k + j) * 4
+            up = (
+                upstream.quats[q],
+                upstream.quats[q + 1],
+                upstream.quats[q + 2],
+                upstream.quats[q + 3],
+            )
+            own = quat_product((w, -x, -y, -z), up)  # turning keeps lengths
+            for c in range(4):
+                planes[(covariance + 3 * k + 4 * j + c) * STRIDE + n] = own[c]
     for j in range(11 * k):
         for n in range(count, COLUMNS):
             planes[(opacity + j) * STRIDE + n] = _ZERO

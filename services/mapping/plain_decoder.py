@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from services.mapping.anchors import AnchorMap, trained_widths
+from services.mapping.quaternions import product
 from services.mapping.rasterizer import Gaussians
 
 
@@ -23,6 +24,7 @@ class PlainAnchors:
 
     index: Tensor  # [V], rows of the map
     positions: Tensor  # [V, 3]
+    turns_world: Tensor  # [V, 4], unit quaternions wxyz: how anchors were turned since they came
     scalings: Tensor  # [V, 6], not trained: units of the offsets and of the sizes, log metres
     colours: Tensor  # [V, k * 3], logits
     offsets: Tensor  # [V, k * 3]
@@ -38,7 +40,8 @@ class PlainAnchors:
             name: rows[name][index].requires_grad_(is_trained)
             for name in trained_widths(anchors.config)
         }
-        return PlainAnchors(index, rows["position"][index], rows["scalings"][index], **trained)
+        given = (rows[name][index] for name in ("position", "turn", "scalings"))
+        return PlainAnchors(index, *given, **trained)
 
 
 def decode_plain(visible: PlainAnchors, initial_opacity: float) -> Gaussians:
@@ -48,11 +51,12 @@ def decode_plain(visible: PlainAnchors, initial_opacity: float) -> Gaussians:
     means = visible.positions[:, None] + visible.offsets.view(count, k, 3) * sizes[..., :3]
     start = math.log(initial_opacity / (1.0 - initial_opacity))
     scales = 0.5 * sizes[..., 3:] * visible.sizes.view(count, k, 3).exp()
-    quats = visible.turns.reshape(-1, 4) + visible.turns.new_tensor([1.0, 0.0, 0.0, 0.0])
+    own = visible.turns.view(count, k, 4) + visible.turns.new_tensor([1.0, 0.0, 0.0, 0.0])
+    quats = product(visible.turns_world[:, None], own)
     return Gaussians(
         means=means.reshape(-1, 3),
         scales=scales.reshape(-1, 3),
-        quats_wxyz=quats,
+        quats_wxyz=quats.reshape(-1, 4),
         opacities=torch.sigmoid(visible.opacities + start).reshape(-1),
         colours=torch.sigmoid(visible.colours).reshape(-1, 3),
     )

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.anchors import AnchorMap, NewAnchors
-from services.mapping.config import AnchorConfig
+from services.mapping.anchors import AnchorMap, NewAnchors, trained_widths
+from services.mapping.config import AnchorConfig, MappingConfig
 from services.mapping.coverage import uncovered
+from services.mapping.decoders import NeuralDecoder, decoder_for
 from services.mapping.depth_fill import filled_depth
+from services.mapping.rasterizer import Gaussians
+from services.mapping.rasterizer.reference import rotations
 from services.mapping.rows import RowTable
 from services.mapping.seeding import SeedRequest, seed_anchors
 from services.mapping.voxels import centres, level_of, levels_at, sizes_m, voxel_keys
@@ -199,6 +202,37 @@ def test_children_turn_with_their_anchor():
     anchors.move(0, T_new_old)
 
     np.testing.assert_allclose(children(), se3.transform(T_new_old, before), atol=1e-5)
+
+
+@pytest.mark.parametrize("gaussians", ["neural", "plain"])
+def test_a_corrected_keyframe_sees_its_gaussians_as_before(gaussians):
+    config = MappingConfig(anchors=AnchorConfig(gaussians=gaussians))
+    anchors = AnchorMap(config.anchors, torch.device("cpu"))
+    anchors.append(new_anchors(30), creator_seq=0)
+    generator = torch.Generator().manual_seed(0)
+    for name in trained_widths(config.anchors):
+        anchors.rows[name].add_(0.5 * torch.randn(anchors.rows[name].shape, generator=generator))
+    decoder = decoder_for(config, 0, torch.device("cpu"))
+    if isinstance(decoder, NeuralDecoder):
+        for weight in decoder.weights.values():
+            weight.data.add_(0.3 * torch.randn(weight.shape, generator=generator))
+    T_new_old, camera = se3.exp([0.5, 0.1, 0.0, 0.3, 0.0, -0.8]), np.array([[0.2, -0.1, -1.0]])
+
+    def seen_from(centre: np.ndarray) -> Gaussians:
+        at = torch.from_numpy(centre[0].astype(np.float32))
+        return decoder.decode(anchors, torch.arange(30), at)[1]
+
+    before = seen_from(camera)
+    anchors.move(0, T_new_old)
+    after = seen_from(se3.transform(T_new_old, camera))
+
+    R = torch.from_numpy(T_new_old[:3, :3]).float()
+    expected = se3.transform(T_new_old, before.means.detach().numpy())
+    np.testing.assert_allclose(after.means.detach(), expected, atol=1e-5)
+    turned = R @ rotations(before.quats_wxyz)
+    torch.testing.assert_close(rotations(after.quats_wxyz), turned, atol=1e-5, rtol=0)
+    for name in ("scales", "opacities", "colours"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name))
 
 
 def test_holes_are_filled_from_around_and_measurements_stay():

@@ -19,9 +19,10 @@ def anchors(count: int = 5000) -> VisibleAnchors:
         return (torch.randn(count, width, generator=generator) * sigma).requires_grad_()
 
     positions = torch.randn(count, 3, generator=generator)
+    turns = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1)
     scalings = (torch.randn(count, 6, generator=generator) * 0.3 - 4.0).requires_grad_()
     return VisibleAnchors(
-        torch.arange(count), positions, normal(32, 1.0), normal(15, 1.0), scalings
+        torch.arange(count), positions, turns, normal(32, 1.0), normal(15, 1.0), scalings
     )
 
 
