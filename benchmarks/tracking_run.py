@@ -34,7 +34,7 @@ from shared.se3 import angle_rad, from_quat_xyzw, inverse
 from shared.tracks import Candidates, CandidatesRequest, TrackingContext, TrackResult
 
 Poses = NDArray[np.float64]  # [F, 4, 4]
-_Key = tuple[int, int]  # revision, seq of the reference
+_Key = tuple[int, int, bool]  # revision, seq of the reference, near only
 _SPAN = 100  # frames whose times are compared
 
 
@@ -84,36 +84,52 @@ class StoreSource:
         self._store = store
         self._config = config
         self._fetching = fetching or NoHelper()
-        self._built: tuple[_Key, bytes] | None = None
-        self._fetched: tuple[_Key, Future[LocalMap]] | None = None
+        self._built: dict[_Key, bytes] = {}
+        self._fetched: dict[_Key, Future[LocalMap]] = {}
 
     def build_ahead(self, seq: int) -> None:
         """What the map's owner does as soon as it has a keyframe."""
-        self._built = (self._key(seq), codec.pack(self._store.context(seq)))
+        self._forget_older()
+        context = self._store.context(seq)
+        self._built[self._key(seq, False)] = codec.pack(context)
+        for loop_seq in context.loop_seqs.tolist():
+            self._built[self._key(loop_seq, True)] = codec.pack(self._store.loop_context(loop_seq))
 
-    def fetch_ahead(self, reference_seq: int) -> Future[LocalMap]:
-        """What a worker does as soon as it has a frame; the last neighbourhood is kept."""
-        key = self._key(reference_seq)
-        if self._fetched is None or self._fetched[0] != key:
-            self._fetched = (key, self._fetching.submit(self._fetch, reference_seq))
-        return self._fetched[1]
+    def fetch_ahead(self, reference_seq: int) -> None:
+        """What a worker does as soon as it has a frame, for it and for its next keyframe."""
+        self._fetch(reference_seq, False)
+        for _, seq, is_near_only in list(self._built):
+            self._fetch(seq, is_near_only)
 
-    def _key(self, seq: int) -> _Key:
-        return self._store.revision, seq
+    def _forget_older(self) -> None:
+        for kept in (self._built, self._fetched):
+            for key in [key for key in kept if key[0] != self._store.revision]:
+                del kept[key]
 
-    def _fetch(self, seq: int) -> LocalMap:
-        if self._built is None or self._built[0] != self._key(seq):
-            self.build_ahead(seq)
-        assert self._built is not None
-        return derive(codec.unpack(TrackingContext, self._built[1]), self._config.registration)
+    def _key(self, seq: int, is_near_only: bool) -> _Key:
+        return self._store.revision, seq, is_near_only
+
+    def _fetch(self, seq: int, is_near_only: bool) -> Future[LocalMap]:
+        self._forget_older()
+        key = self._key(seq, is_near_only)
+        if key not in self._fetched:
+            self._fetched[key] = self._fetching.submit(self._receive, key, self._built.get(key))
+        return self._fetched[key]
+
+    def _receive(self, key: _Key, built: bytes | None) -> LocalMap:
+        if built is None:
+            _, seq, is_near_only = key
+            ask = self._store.loop_context if is_near_only else self._store.context
+            built = codec.pack(ask(seq))
+        return derive(codec.unpack(TrackingContext, built), self._config.registration)
 
     def local_map(self, reference_seq: int) -> LocalMap:
         """The neighbourhood of a keyframe."""
-        return self.fetch_ahead(reference_seq).result()
+        return self._fetch(reference_seq, False).result()
 
     def loop_map(self, seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, of what is near to it in the graph only."""
-        return derive(self._store.loop_context(seq), self._config.registration)
+        return self._fetch(seq, True).result()
 
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """Keyframes that look like a frame."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from services.mapping.contexts import Contexts
 from services.mapping.entries import check_entry
 from services.mapping.frame_records import FrameRecords
 from services.mapping.keyframes import KeyframeConfig, KeyframeStore
@@ -59,9 +60,9 @@ class Ledger:
         self._records = FrameRecords()
         self.prior: Prior | None = None  # what the next frame starts from
         self._store = KeyframeStore(config)
-        self._context: TrackingContext | None = None  # the last one asked for
         self._ahead = ThreadPoolExecutor(1, thread_name_prefix="context")
         self.resumed = self._resume(folder, record.log_ends, config)
+        self._contexts = Contexts(self._store)
         self._log = SessionLog(folder.log_path(record.epoch))
 
     def _resume(
@@ -137,9 +138,15 @@ class Ledger:
             with LOG_SECONDS.time():
                 self._log.append(entry)
             new = self._apply(entry)
-        if new is not None:  # the next frame asks for it: it is there when the frame is decoded
-            self._ahead.submit(self.context, ContextRequest(self.revision, record.seq))
+        if new is not None:
+            self._ahead.submit(self._build_ahead, record.seq)
         return new
+
+    def _build_ahead(self, seq: int) -> None:
+        """What the next frames ask for is there when they come."""
+        context = self.context(ContextRequest(self.revision, seq))
+        for loop_seq in context.loop_seqs.tolist():
+            self.context(ContextRequest(context.revision, loop_seq, is_near_only=True))
 
     def _apply(self, entry: Advance) -> NewKeyframe | None:
         record = entry.record
@@ -160,14 +167,13 @@ class Ledger:
             return self._store.poses()
 
     def context(self, request: ContextRequest) -> TrackingContext:
-        """The neighbourhood of a keyframe; the last one is kept."""
+        """The neighbourhood of a keyframe.
+
+        Raises:
+            NotFoundError: no such keyframe, where only what is near to it is asked for.
+        """
         with self._lock:
-            if request.is_near_only:
-                return self._store.loop_context(request.reference_seq)
-            last, seq = self._context, request.reference_seq
-            if last is None or (last.revision, last.reference_seq) != (self.revision, seq):
-                self._context = last = self._store.context(seq)
-            return last
+            return self._contexts.get(request)
 
     def candidates(self, request: CandidatesRequest) -> Candidates:
         """Keyframes that look like a frame."""

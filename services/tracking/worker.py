@@ -80,18 +80,28 @@ class BusSource:
         self._request = request
         self._cache = cache
         self._config = config
-        self._ahead: dict[int, Future[LocalMap]] = {}
+        self._ahead: dict[tuple[int, bool], Future[LocalMap]] = {}  # by seq, near only
 
     def fetch_ahead(self, reference_seq: int, executor: Executor) -> None:
-        """Ask for a neighbourhood now; it comes while the frame is decoded."""
-        self._ahead[reference_seq] = executor.submit(self._local_map, reference_seq)
+        """Ask for a neighbourhood now; it comes while the frame is decoded.
+
+        Those of its loop candidates come after: the next keyframe will want them.
+        """
+        fetched = executor.submit(self._with_loop_maps, reference_seq, executor)
+        self._ahead[reference_seq, False] = fetched
+
+    def _with_loop_maps(self, reference_seq: int, executor: Executor) -> LocalMap:
+        local = self._local_map(reference_seq)
+        for seq in local.context.loop_seqs[: self._config.loop.max_candidates].tolist():
+            self._ahead[seq, True] = executor.submit(self._local_map, seq, is_near_only=True)
+        return local
 
     def local_map(self, reference_seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, from the cache where it is there.
 
         An older one of the session where that will do and the owner is absent or keeps silent.
         """
-        ahead = self._ahead.get(reference_seq)
+        ahead = self._ahead.get((reference_seq, False))
         if ahead is None:
             return self._local_map(reference_seq)
         older = self._older_map()
@@ -108,7 +118,8 @@ class BusSource:
 
     def loop_map(self, seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, of what is near to it in the graph only."""
-        return self._local_map(seq, is_near_only=True)
+        ahead = self._ahead.get((seq, True))
+        return self._local_map(seq, is_near_only=True) if ahead is None else ahead.result()
 
     def _local_map(self, reference_seq: int, is_near_only: bool = False) -> LocalMap:
         session, epoch = self._request.session, self._request.epoch

@@ -122,6 +122,18 @@ def test_a_context_holds_a_keyframe_at_once(open_session, entry):
     assert len(context.cloud_world.points) > 0
 
 
+def test_a_neighbourhood_is_built_once_until_the_next_keyframe(open_session, entry):
+    session = open_session()
+    session.advance(entry(0))
+
+    first, again = (session.ledger.context(ContextRequest(1, 0)) for _ in range(2))
+    session.advance(entry(4))
+    later = session.ledger.context(ContextRequest(2, 0))
+
+    assert again is first
+    assert (first.revision, later.revision) == (1, 2)
+
+
 def test_every_revision_is_published(open_session, entry, published):
     session = open_session()
 
