@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import grpc
@@ -54,17 +56,18 @@ class _Guarded:
             make, behaviour = grpc.unary_stream_rpc_method_handler, handler.unary_stream
         else:
             make, behaviour = grpc.unary_unary_rpc_method_handler, handler.unary_unary
-        guard = self._stream if inspect.isasyncgenfunction(behaviour) else self._call
-        return make(guard(behaviour), handler.request_deserializer, handler.response_serializer)
+        guarded = self._stream(behaviour) if _is_generator(behaviour) else self._call(behaviour)
+        return make(guarded, handler.request_deserializer, handler.response_serializer)
 
     def _call(self, behaviour: Any) -> Callable[[Any, Any], Awaitable[Any]]:
         async def call(request: Any, context: Any) -> Any:
             caller = await self._admit(context)
             outcome = "OK"
             try:
-                return await behaviour(request, context)
+                async with self._while_valid(caller, context):
+                    return await behaviour(request, context)
             except BaseException:
-                outcome = str(context.code())
+                outcome = getattr(context.code(), "name", "INTERNAL")
                 raise
             finally:
                 if self._access == ADMIN:
@@ -74,9 +77,10 @@ class _Guarded:
 
     def _stream(self, behaviour: Any) -> Callable[[Any, Any], AsyncIterator[Any]]:
         async def stream(request: Any, context: Any) -> AsyncIterator[Any]:
-            await self._admit(context)
-            async for response in behaviour(request, context):
-                yield response
+            caller = await self._admit(context)
+            async with self._while_valid(caller, context):
+                async for response in behaviour(request, context):
+                    yield response
 
         return stream
 
@@ -90,3 +94,28 @@ class _Guarded:
                 raise
         CALLER.set(caller)
         return caller
+
+    @asynccontextmanager
+    async def _while_valid(self, caller: Caller, context: Any) -> AsyncIterator[None]:
+        """End the call when its caller's key ends before it."""
+        serving = asyncio.current_task()
+
+        async def watch() -> None:
+            while self._authority.is_valid(caller):
+                await asyncio.sleep(self._authority.config.recheck_s)
+            with suppress(grpc.aio.AbortError):
+                await context.abort(
+                    grpc.StatusCode.UNAUTHENTICATED, "the key is no longer accepted"
+                )
+            if serving is not None:
+                serving.cancel()
+
+        watching = asyncio.create_task(watch())
+        try:
+            yield
+        finally:
+            watching.cancel()
+
+
+def _is_generator(behaviour: Any) -> bool:
+    return inspect.isasyncgenfunction(behaviour)
