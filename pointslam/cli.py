@@ -1,4 +1,4 @@
-"""The command line: `pointslam run | evaluate | up | keys | synth | refine | export | bench`."""
+"""The command line: `pointslam run | evaluate | up | keys | synth | refine | export | ...`."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_synth(commands.add_parser("synth", help="render a procedural room with exact truth"))
     _add_refine(commands.add_parser("refine", help="optimise a session's map further"))
     _add_export(commands.add_parser("export", help="a run's or a session's map as a file"))
+    _add_convert(commands.add_parser("convert", help="a sequence as an MCAP file"))
     _add_bench(commands.add_parser("bench", help="measure one part"))
     return parser
 
@@ -217,6 +218,20 @@ def _export(arguments: argparse.Namespace) -> None:
     format = TrajectoryFormat(name) if name in set(TrajectoryFormat) else ExportFormat(name)
     target = export_source(arguments.source, format, arguments.gateway, arguments.out)
     _say(str(target))
+
+
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
+    parser.add_argument("file", type=Path, metavar="FILE.mcap")
+    parser.add_argument("--trajectory", type=Path, metavar="TUM", help="poses to show, of a run")
+    parser.set_defaults(command=_convert)
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    from pointslam.recording import convert_sequence
+
+    convert_sequence(arguments.sequence, arguments.file, arguments.trajectory)
+    _say(str(arguments.file))
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:

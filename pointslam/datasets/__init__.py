@@ -14,6 +14,7 @@ from pointslam.datasets.base import (
     is_held_out,
 )
 from pointslam.datasets.folder import is_folder, read_folder
+from pointslam.datasets.mcap import is_mcap, read_mcap
 from pointslam.datasets.replica import is_replica, read_replica
 from pointslam.datasets.scannetpp import is_scene, read_scene
 from pointslam.datasets.scannetpp_dslr import is_dslr, read_dslr
@@ -48,14 +49,17 @@ FORMATS: dict[str, tuple[Detect, Read]] = {
 
 
 def open_sequence(path: Path | str, options: SequenceOptions | None = None) -> FileSequence:
-    """Open a folder of any format we know.
+    """Open a folder of any format we know, or an MCAP file.
 
     Raises:
         SequenceError: names the file that cannot be read and what is wrong with it.
     """
     path = Path(path)
+    if is_mcap(path):
+        return read_mcap(path, options or SequenceOptions())
     if not path.is_dir():
-        raise SequenceError(path, "is no folder" if path.exists() else "does not exist")
+        found = "is no folder and no .mcap file" if path.exists() else "does not exist"
+        raise SequenceError(path, found)
     for detect, read in FORMATS.values():
         if detect(path):
             return read(path, options or SequenceOptions())

@@ -30,6 +30,8 @@ class SequenceOptions:
     max_association_s: float = 0.02
     depth_scale: float | None = None
     raw_depth: bool = False
+    colour_topic: str | None = None  # of an MCAP file with several
+    depth_topic: str | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.max_association_s <= 1:
