@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from services.mapping.membership import is_among
 from services.mapping.voxel_merge import merge_clouds
 from shared.errors import ConfigError
 from shared.se3 import inverse, rotate, transform
@@ -252,7 +253,7 @@ def _window(
     """Bundle-adjustment window: the reference, then the keyframes that share most landmarks."""
     reference_ids = near[0].observations.landmark_ids
     reference_ids = reference_ids[reference_ids >= 0]
-    shared = [np.isin(k.observations.landmark_ids, reference_ids).sum() for k in near]
+    shared = [is_among(k.observations.landmark_ids, reference_ids).sum() for k in near]
     ranked = [i for i in np.argsort(-np.array(shared), kind="stable") if i > 0]
     covisible = [near[i] for i in ranked if shared[i] >= config.min_shared_landmarks]
     free = [near[0], *covisible[: config.max_free_keyframes - 1]]

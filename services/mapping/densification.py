@@ -11,6 +11,7 @@ from torch import Tensor
 
 from services.mapping.anchors import AnchorMap, NewAnchors
 from services.mapping.config import AnchorConfig, DensificationConfig
+from services.mapping.membership import is_among
 from services.mapping.voxels import MIN_LEVEL, centres, level_of, sizes_m, voxel_keys
 
 _CHILD_SPREAD = 0.25  # of a voxel: new children around their parent child
@@ -93,8 +94,8 @@ def _halve_occupants(
     is_asked, is_free = np.zeros(len(anchors), bool), np.ones(len(keys), bool)
     for level in np.unique(levels):
         present = voxel_keys(positions, np.full(len(positions), level), placement)
-        is_asked |= np.isin(present, keys)
-        is_free &= ~np.isin(keys, present)
+        is_asked |= is_among(present, keys)
+        is_free &= ~is_among(keys, present)
     is_halved = torch.from_numpy(is_asked).to(anchors.device) & ~rows["is_primary"]
     rows["gate"].copy_((rows["gate"] * torch.where(is_halved, 0.5, 2.0)).clamp_max(1.0))
     return is_free
@@ -133,7 +134,7 @@ def _around(
 def _append_by_creator(anchors: AnchorMap, new: NewAnchors, creators: NDArray[np.int64]) -> int:
     """Add those whose voxel is free, each moving with its parent's keyframe from now on."""
     _, first = np.unique(new.keys, return_index=True)
-    free = first[~np.isin(new.keys[first], anchors.keys())]
+    free = first[~is_among(new.keys[first], anchors.keys())]
     added = 0
     for creator in np.unique(creators[free]):
         added += anchors.append(new.take(free[creators[free] == creator]), int(creator))

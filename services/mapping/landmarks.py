@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.context import LandmarkTable
+from services.mapping.membership import is_among
 from shared.se3 import rotate, transform
 from shared.tracks import KEYPOINT_BITS, KeyframeData, Observations
 
@@ -55,7 +56,7 @@ def moved(table: LandmarkTable, T_new_old: Mapping[int, NDArray[np.float64]]) ->
 
 def without(table: LandmarkTable, ids: NDArray[np.int64]) -> LandmarkTable:
     """The table without some landmarks."""
-    keep = ~np.isin(table.ids, ids)
+    keep = ~is_among(table.ids, ids)
     return LandmarkTable(table.ids[keep], table.positions_world[keep], table.normals_world[keep])
 
 
@@ -72,7 +73,7 @@ def renamed(observations: Observations, pairs: NDArray[np.int64]) -> Observation
     if len(pairs) == 0:
         return observations
     at = np.minimum(np.searchsorted(pairs[:, 1], ids), len(pairs) - 1)
-    is_dropped = (pairs[at, 1] == ids) & ~np.isin(pairs[at, 0], ids)
+    is_dropped = (pairs[at, 1] == ids) & ~is_among(pairs[at, 0], ids)
     if not is_dropped.any():
         return observations
     return replace(observations, landmark_ids=np.where(is_dropped, pairs[at, 0], ids))
@@ -84,4 +85,4 @@ def one_to_one(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     pairs = pairs[first]
     _, first = np.unique(pairs[:, 0], return_index=True)
     pairs = pairs[np.sort(first)]
-    return pairs[~np.isin(pairs[:, 1], pairs[:, 0])]
+    return pairs[~is_among(pairs[:, 1], pairs[:, 0])]

@@ -38,11 +38,13 @@ class RowTable:
             column[new] = rows[name].to(column) if name in rows else 0
 
     def keep(self, is_kept: Tensor) -> None:
-        """Remove the rows where `is_kept` [N] is false."""
-        for name, column in self._columns.items():
-            kept = column[: self._size][is_kept]
-            self._columns[name][: len(kept)] = kept
-        self._size = int(is_kept.sum())
+        """Remove the rows where `is_kept` [N] is false; the last rows take their places."""
+        size = int(is_kept.sum())
+        holes = (~is_kept[:size]).nonzero()[:, 0]
+        movers = size + is_kept[size:].nonzero()[:, 0]
+        for column in self._columns.values():
+            column[holes] = column[movers]
+        self._size = size
 
     def copy(self, names: Collection[str]) -> RowTable:
         """A table of its own with those of the columns `names` that there are."""

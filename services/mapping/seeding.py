@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from services.mapping.anchors import FEATURES, NewAnchors
 from services.mapping.config import AnchorConfig
 from services.mapping.depth_fill import filled_depth
+from services.mapping.membership import is_among
 from services.mapping.voxels import centres, levels_at, sizes_m, voxel_keys
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
@@ -60,7 +61,7 @@ def seed_anchors(
     samples = _samples(request, config, rng)
     fx = request.image.intrinsics.fx
     starts, counts = _supported_voxels(samples, 1.0 / fx, config)
-    is_free = ~np.isin(samples.keys[starts], taken)
+    is_free = ~is_among(samples.keys[starts], taken)
     starts, counts = starts[is_free], counts[is_free]
     picks = _pick_children(starts, counts, config.children)
     levels = samples.levels[starts]
@@ -142,7 +143,7 @@ def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generato
     points = transform(request.T_world_camera, rays * depths[:, None])
     levels = levels_at(depths, config)
     keys = voxel_keys(points, levels, config)
-    is_landmark = np.isin(keys, landmarks.keys)
+    is_landmark = is_among(keys, landmarks.keys)
     wanted = np.flatnonzero(request.is_uncovered[rows, columns] | is_landmark)
     wanted = wanted[np.argsort(keys[wanted], kind="stable")]
     return _Samples(

