@@ -1,10 +1,11 @@
 """Renders while the map is optimised: how long a request waits, and what it costs the optimisation.
 
-python -m benchmarks.renders [SEQUENCE] [--frames N] [--seconds S] [--json]
+python -m benchmarks.renders [SEQUENCE] [--frames N] [--seconds S] [--http] [--json]
 
 One session in this process, its worker refining all the time; one client asks for novel views
 (no two alike, so that none comes from the cache), then for one view again and again. Then a
-snapshot is captured. Without a sequence, a procedural room is recorded first.
+snapshot is captured. With --http, a client asks all services, as processes of their own, instead.
+Without a sequence, a procedural room is recorded first.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.mapping_run import new_keyframe, true_pose
+from benchmarks.renders_http import asked, measure_http, spread
 from pointslam.datasets import FileSequence, open_sequence
 from pointslam.synth import SynthOptions, write_sequence
 from services.mapping.config import MappingConfig
@@ -44,6 +46,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("sequence", type=Path, nargs="?")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each part")
+    parser.add_argument("--http", action="store_true", help="through a gateway")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser.parse_args(argv)
 
@@ -57,17 +60,6 @@ def built_map(sequence: FileSequence, frames: int) -> tuple[Mapper, list[NDArray
         mapper.insert_keyframe(new_keyframe(sequence, index, poses))
         mapper.iterate(2)
     return mapper, list(poses.values())
-
-
-def asked(renders: Renders, requests: list[RenderRequest], seconds: float) -> list[float]:
-    """Milliseconds of each request, one after the other for so long."""
-    times_ms: list[float] = []
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        start = time.perf_counter()
-        renders.answer(requests[len(times_ms) % len(requests)])
-        times_ms.append(1e3 * (time.perf_counter() - start))
-    return times_ms
 
 
 def iterations_per_s(worker: MapWorker, seconds: float) -> float:
@@ -94,9 +86,13 @@ def measure(sequence: FileSequence, options: argparse.Namespace) -> dict[str, An
         result: dict[str, Any] = {"anchors": len(mapper.anchors)}
         result["iterations_per_s_alone"] = iterations_per_s(worker, options.seconds)
         before = worker.iterations
-        result |= spread("new_view", asked(renders, views, options.seconds))
+        result |= spread(
+            "new_view", asked(lambda i: renders.answer(views[i % 1000]), options.seconds)
+        )
         result["iterations_per_s_rendering"] = (worker.iterations - before) / options.seconds
-        result |= spread("same_view", asked(renders, views[:1], options.seconds / 2))
+        result |= spread(
+            "same_view", asked(lambda _: renders.answer(views[0]), options.seconds / 2)
+        )
         result["snapshot_pause_ms"] = snapshot_pause_ms(worker)
         worker.interrupt()
         worker.stop()
@@ -115,22 +111,21 @@ def snapshot_pause_ms(worker: MapWorker) -> float:
     return float(np.median([worker.visit(lambda m, room=room: copied(m, room)) for room in rooms]))
 
 
-def spread(name: str, times_ms: list[float]) -> dict[str, Any]:
-    """Median and tail of times."""
-    p50, p95 = np.percentile(times_ms, [50, 95])
-    return {f"{name}s": len(times_ms), f"{name}_ms_p50": float(p50), f"{name}_ms_p95": float(p95)}
-
-
 def main(argv: list[str]) -> int:
     """Print the measurements."""
     options = arguments(argv)
     try:
-        warm_up()
+        if not options.http:
+            warm_up()
         with tempfile.TemporaryDirectory() as folder:
             if options.sequence is None:
                 options.sequence = Path(folder) / "room"
                 write_sequence(options.sequence, SynthOptions(num_frames=options.frames))
-            result = measure(open_sequence(options.sequence), options)
+            sequence = open_sequence(options.sequence)
+            if options.http:
+                result = measure_http(sequence, options.frames, options.seconds)
+            else:
+                result = measure(sequence, options)
     except PointSlamError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
