@@ -73,7 +73,7 @@ class MappingIteration:
             step = begin_step(self._painter.anchors.rows, visible.index)
             for name in trained_widths(self._config.anchors):
                 adam_rows(step, name, getattr(visible, name).grad, 1e-6)
-            self._painter.decoder.step(rate=1.0)
+            self._painter.decoder.step(self._config.rates)
 
     def _darker(self) -> Target:
         rendered = self._painter.draw(self._view).rendered

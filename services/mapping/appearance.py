@@ -20,8 +20,7 @@ IDENTITY = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]], np.float32)  # gain, bia
 class ExposureModel:
     """Exposures by keyframe seq, each [2, 3]: gain, then bias; seqs come in order of time."""
 
-    def __init__(self, rates: LearningRates) -> None:
-        self._rates = np.array([[rates.exposure_gain], [rates.exposure_bias]], np.float32)
+    def __init__(self) -> None:
         self._times: dict[int, int] = {}  # seq to t_ns
         self._rows: dict[int, NDArray[np.float32]] = {}  # [3, 2, 3]: value and Adam's moments
         self._steps: dict[int, int] = {}
@@ -51,7 +50,7 @@ class ExposureModel:
         mixed = [np.interp(at, seconds, column) for column in columns]
         return np.array(mixed, np.float32).reshape(2, 3)
 
-    def step(self, seq: int, gradient: NDArray[np.float32], rate: float) -> None:
+    def step(self, seq: int, gradient: NDArray[np.float32], rates: LearningRates) -> None:
         """One step of Adam for a keyframe's exposure; `gradient` is [2, 3], finite or ignored."""
         if seq == next(iter(self._rows)) or not np.isfinite(gradient).all():
             return
@@ -61,7 +60,8 @@ class ExposureModel:
         square += (1.0 - BETA_SQUARE) * (gradient * gradient - square)
         corrected = mean / (1.0 - BETA_MEAN ** self._steps[seq])
         root = np.sqrt(square) / math.sqrt(1.0 - BETA_SQUARE ** self._steps[seq])
-        value -= rate * self._rates * corrected / (root + EPSILON)
+        own = np.array([[rates.exposure_gain], [rates.exposure_bias]], np.float32)
+        value -= own * corrected / (root + EPSILON)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything, as arrays."""

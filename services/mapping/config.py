@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from services.mapping.keyframes import KeyframeConfig
 from shared.errors import ConfigError
@@ -80,7 +80,25 @@ class LearningRates:
     covariance_network: float = 4e-3
     exposure_gain: float = 5e-3
     exposure_bias: float = 2e-3
-    refinement_decay: float = 0.1  # of all rates, at the end of a refinement
+
+    def scaled(self, factor: float) -> LearningRates:
+        """All rates times a factor."""
+        return LearningRates(**{f.name: factor * getattr(self, f.name) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Steps of Adam in a refinement: wide at first, as there is time to settle."""
+
+    rates: LearningRates = LearningRates(features=0.04, scalings=0.02, opacity_network=8e-3)
+    decay: float = 0.1  # of all rates, at the end
+
+    def __post_init__(self) -> None:
+        _check(0 < self.decay <= 1, f"refinement.decay must be 0 to 1, got {self.decay}")
+
+    def at(self, progress: float) -> LearningRates:
+        """The rates at 0 <= `progress` < 1 of a refinement."""
+        return self.rates.scaled(self.decay**progress)
 
 
 @dataclass(frozen=True)
@@ -197,6 +215,7 @@ class MappingConfig:
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     rates: LearningRates = field(default_factory=LearningRates)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)

@@ -81,8 +81,13 @@ def initial_weights(anchors: AnchorConfig, decoder: DecoderConfig, seed: int) ->
     }
 
 
-def weight_optimizer(weights: Weights, rates: LearningRates) -> WeightAdam:
+def weight_optimizer(weights: Weights) -> WeightAdam:
     """Adam over the networks."""
+    return WeightAdam({name: weights[name] for name in WEIGHTS})
+
+
+def weight_rates(rates: LearningRates) -> dict[str, float]:
+    """The learning rate of each of the networks' weights."""
     per_network = {
         "hidden": rates.covariance_network,
         "opacity": rates.opacity_network,
@@ -90,8 +95,7 @@ def weight_optimizer(weights: Weights, rates: LearningRates) -> WeightAdam:
         "covariance": rates.covariance_network,
         "skip": rates.opacity_network,
     }
-    ordered = {name: weights[name] for name in WEIGHTS}
-    return WeightAdam(ordered, {name: per_network[name.split("_")[0]] for name in WEIGHTS})
+    return {name: per_network[name.split("_")[0]] for name in WEIGHTS}
 
 
 def decode(

@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from services.mapping.anchors import AnchorMap
-from services.mapping.config import MappingConfig
+from services.mapping.config import LearningRates, MappingConfig
 from services.mapping.decoder import (
     VisibleAnchors,
     Weights,
     decode,
     initial_weights,
     weight_optimizer,
+    weight_rates,
 )
 from services.mapping.decoder_cpu import decode_cpu
 from services.mapping.plain_decoder import PlainAnchors, decode_plain
@@ -43,8 +44,8 @@ class Decoder(Protocol):
         """
         ...
 
-    def step(self, rate: float) -> None:
-        """Take one step of Adam with the gradients there are; `rate` scales all rates."""
+    def step(self, rates: LearningRates) -> None:
+        """Take one step of Adam with the gradients there are."""
         ...
 
     def state(self) -> Groups:
@@ -69,7 +70,7 @@ class NeuralDecoder:
     def __init__(self, config: MappingConfig, seed: int, device: torch.device) -> None:
         weights = initial_weights(config.anchors, config.decoder, seed)
         self.weights: Weights = {n: w.to(device).requires_grad_() for n, w in weights.items()}
-        self._optimizer = weight_optimizer(self.weights, config.rates)
+        self._optimizer = weight_optimizer(self.weights)
         self._function = decode_cpu if device.type == "cpu" else decode
 
     @property
@@ -84,9 +85,9 @@ class NeuralDecoder:
         visible = VisibleAnchors.gather(anchors, index, is_trained)
         return visible, self._function(visible, camera_world, self.weights)
 
-    def step(self, rate: float) -> None:
+    def step(self, rates: LearningRates) -> None:
         """As `Decoder.step`."""
-        self._optimizer.step(rate)
+        self._optimizer.step(weight_rates(rates))
 
     def state(self) -> Groups:
         """Weights and Adam's moments."""
@@ -116,7 +117,7 @@ class PlainDecoder:
         visible = PlainAnchors.gather(anchors, index, is_trained)
         return visible, decode_plain(visible, self._initial_opacity)
 
-    def step(self, rate: float) -> None:
+    def step(self, rates: LearningRates) -> None:
         """Nothing is shared."""
 
     def state(self) -> Groups:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from services.mapping.anchors import FEATURES, AnchorMap
-from services.mapping.config import MappingConfig
+from services.mapping.config import LearningRates, MappingConfig
 from services.mapping.decoders import Visible
 from services.mapping.weight_adam import WeightAdam
 
@@ -39,9 +39,8 @@ class Environment:
         if self._kind in ("environment", "both"):
             weights = _initial_weights(self._generator)
             self._weights = {n: w.to(device).requires_grad_() for n, w in weights.items()}
-            rates = dict.fromkeys(self._weights, config.rates.colour_network)
-            self._optimizer = WeightAdam(self._weights, rates)
-            self._warm_up(device)
+            self._optimizer = WeightAdam(self._weights)
+            self._warm_up(device, config.rates)
 
     @torch.no_grad()
     def initialise(self, anchors: AnchorMap, count: int, centre: NDArray[np.float64]) -> None:
@@ -62,7 +61,7 @@ class Environment:
         features[:, first:] = self._embed(rows["seen"][new])[:, first:]
 
     @torch.enable_grad()
-    def step(self, anchors: AnchorMap, visible: Visible, rate: float) -> None:
+    def step(self, anchors: AnchorMap, visible: Visible, rates: LearningRates) -> None:
         """Learn from the gradients at the features of the young anchors in view."""
         if not self._weights:
             return
@@ -74,7 +73,7 @@ class Environment:
         gradient = visible.features.grad[is_young]  # pyright: ignore
         first = 0 if self._kind == "environment" else self._colours
         self._embed(seen[is_young])[:, first:].backward(gradient[:, first:])
-        self._optimizer.step(rate)
+        self._step(rates)
 
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Groups of tensors for a snapshot."""
@@ -98,7 +97,10 @@ class Environment:
         hidden = torch.relu(seen @ w["hidden_weight"] + w["hidden_bias"])
         return hidden @ w["output_weight"] + w["output_bias"]
 
-    def _warm_up(self, device: torch.device) -> None:
+    def _step(self, rates: LearningRates) -> None:
+        self._optimizer.step(dict.fromkeys(self._weights, rates.colour_network))
+
+    def _warm_up(self, device: torch.device, rates: LearningRates) -> None:
         """Fit the embedding until the untrained colour network gives back the colours."""
         for _ in range(_WARM_UP_STEPS):
             drawn = torch.randn(_WARM_UP_BATCH, 3, generator=self._generator)
@@ -107,7 +109,7 @@ class Environment:
             features = self._embed(torch.cat([colours, direction], 1).to(device))
             shown = torch.sigmoid(features[:, : self._colours]).view(_WARM_UP_BATCH, -1, 3)
             (shown - colours.to(device)[:, None]).square().mean().backward()
-            self._optimizer.step(1.0)
+            self._step(rates)
 
 
 def _initial_weights(generator: torch.Generator) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ from services.mapping import densification
 from services.mapping.anchors import AnchorMap, trained_widths
 from services.mapping.appearance import ExposureModel
 from services.mapping.carving import carve
-from services.mapping.config import MappingConfig
+from services.mapping.config import LearningRates, MappingConfig
 from services.mapping.coverage import uncovered_pixels
 from services.mapping.decoders import decoder_for
 from services.mapping.environment import Environment
@@ -82,7 +82,7 @@ class Mapper:
         self.painter = Painter(
             self.anchors, self.decoder, rasterizer_for(device.type), config.decoder
         )
-        self.exposures = ExposureModel(config.rates)
+        self.exposures = ExposureModel()
         self.views = TrainingViews(
             calibration, config.schedule, seed, lambda image: Target.of(image, device)
         )
@@ -136,12 +136,13 @@ class Mapper:
     def iterate(self, count: int = 1) -> None:
         """Optimise on so many draws of keyframes (paper Eq. 8); nothing without keyframes."""
         for _ in range(count if len(self.views) else 0):
-            self._step(self.views.draw(), progress=0.0)
+            self._step(self.views.draw(), self.config.rates)
 
     def refine(self, progress: float) -> None:
         """One iteration of a refinement, at 0 <= `progress` < 1 of it; rates decay with it."""
         if len(self.views):
-            self._step(self.views.draw_in_rounds(), progress)
+            rates = self.config.refinement.at(progress)
+            self._step(self.views.draw_in_rounds(), rates, progress)
 
     def render(self, request: RenderRequest) -> RenderReply:
         """A view of the map, with the exposure of a time or the mean one."""
@@ -206,9 +207,10 @@ class Mapper:
         self._rng.bit_generator.state = state.values["generator"]
         self.views.restore(state.values["views"], frames)
 
-    def _step(self, keyframe: TrainingView, progress: float) -> None:
+    def _step(
+        self, keyframe: TrainingView, rates: LearningRates, progress: float = 0.0
+    ) -> None:
         """One optimisation step on one keyframe, at 0 <= `progress` < 1 of a refinement."""
-        rate = self.config.rates.refinement_decay**progress
         with self.stages.stage("target"):
             target = self.views.target(keyframe.seq)
         exposure = torch.from_numpy(self.exposures.of(keyframe.seq)).to(self._device)
@@ -224,9 +226,9 @@ class Mapper:
             with self.stages.stage("backward"):
                 loss.total.backward()
             with self.stages.stage("update"), self._changing:
-                self._update(drawn, rate)
+                self._update(drawn, rates)
                 assert exposure.grad is not None
-                self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rate)
+                self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rates)
                 self._densify(drawn, progress)
         self._squared_errors.append(float(loss.squared_error))
 
@@ -238,15 +240,14 @@ class Mapper:
             return Drawn(visible, gaussians, self.painter.rasterizer(gaussians, view))
 
     @torch.no_grad()
-    def _update(self, drawn: Drawn, rate: float) -> None:
+    def _update(self, drawn: Drawn, rates: LearningRates) -> None:
         """Adam over the visible anchors and the networks."""
-        self._environment.step(self.anchors, drawn.visible, rate)
+        self._environment.step(self.anchors, drawn.visible, rates)
         step = begin_step(self.anchors.rows, drawn.visible.index)
         for name in trained_widths(self.config.anchors):
             gradient = getattr(drawn.visible, name).grad
-            own = getattr(self.config.rates, name)
-            adam_rows(step, name, gradient, rate * own)
-        self.decoder.step(rate)
+            adam_rows(step, name, gradient, getattr(rates, name))
+        self.decoder.step(rates)
 
     @torch.no_grad()
     def _densify(self, drawn: Drawn, progress: float) -> None:

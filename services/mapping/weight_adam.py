@@ -19,23 +19,22 @@ _EPSILON = 1e-15
 class WeightAdam:
     """Steps named weights, each at its own rate, by the gradients that they have."""
 
-    def __init__(self, weights: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
+    def __init__(self, weights: Mapping[str, Tensor]) -> None:
         self._weights = dict(weights)
-        self._rates = dict(rates)
         self._means = {name: torch.zeros_like(weight) for name, weight in weights.items()}
         self._squares = {name: torch.zeros_like(weight) for name, weight in weights.items()}
         self._steps = dict.fromkeys(weights, 0)
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """One step of every weight with a gradient, which is dropped; `rate` scales all rates.
+    def step(self, rates: Mapping[str, float]) -> None:
+        """One step of every weight with a gradient, which is dropped; `rates` has one for each.
 
         A slope that is no number counts as 0.
         """
         drop_faults(self._weights.values())
         for name, weight in self._weights.items():
             if weight.grad is not None:
-                self._step(name, weight, weight.grad, rate * self._rates[name])
+                self._step(name, weight, weight.grad, rates[name])
                 weight.grad = None
 
     def _step(self, name: str, weight: Tensor, gradient: Tensor, rate: float) -> None:

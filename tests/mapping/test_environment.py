@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from services.mapping.anchors import AnchorMap, NewAnchors
-from services.mapping.config import AnchorConfig, MappingConfig
+from services.mapping.config import AnchorConfig, LearningRates, MappingConfig
 from services.mapping.decoder import VisibleAnchors
 from services.mapping.decoders import NeuralDecoder
 from services.mapping.environment import Environment
@@ -107,7 +107,7 @@ def learn(seeded):
         visible, _ = decoder.decode(anchors, torch.arange(COUNT), camera, is_trained=True)
         assert isinstance(visible, VisibleAnchors)
         visible.features.grad = visible.features.detach().clone()
-        environment.step(anchors, visible, rate=1.0)
+        environment.step(anchors, visible, LearningRates())
 
     return run
 

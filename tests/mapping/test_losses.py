@@ -117,7 +117,7 @@ def test_the_background_shows_where_alpha_is_low():
 
 
 def exposures() -> ExposureModel:
-    model = ExposureModel(LearningRates())
+    model = ExposureModel()
     for seq, t_ns in ((0, 0), (5, 1_000_000_000), (9, 3_000_000_000)):
         model.add(seq, t_ns)
     return model
@@ -126,7 +126,7 @@ def exposures() -> ExposureModel:
 def test_the_first_keyframes_exposure_stays_the_identity():
     model = exposures()
 
-    model.step(0, np.ones((2, 3), np.float32), 1.0)
+    model.step(0, np.ones((2, 3), np.float32), LearningRates())
 
     np.testing.assert_array_equal(model.of(0), IDENTITY)
 
@@ -134,7 +134,7 @@ def test_the_first_keyframes_exposure_stays_the_identity():
 def test_a_step_moves_gain_and_bias_by_their_rates():
     model = exposures()
 
-    model.step(5, np.ones((2, 3), np.float32), 1.0)
+    model.step(5, np.ones((2, 3), np.float32), LearningRates())
 
     expected = [[1 - 5e-3] * 3, [-2e-3] * 3]
     np.testing.assert_allclose(model.of(5), expected, rtol=1e-5)
@@ -142,7 +142,7 @@ def test_a_step_moves_gain_and_bias_by_their_rates():
 
 def test_exposure_is_linear_between_keyframes_and_constant_outside():
     model = exposures()
-    model.step(9, np.ones((2, 3), np.float32), 1.0)
+    model.step(9, np.ones((2, 3), np.float32), LearningRates())
 
     half = model.at(2_000_000_000)
 
@@ -153,17 +153,17 @@ def test_exposure_is_linear_between_keyframes_and_constant_outside():
 
 def test_without_a_time_the_mean_exposure_is_drawn():
     model = exposures()
-    model.step(9, np.ones((2, 3), np.float32), 1.0)
+    model.step(9, np.ones((2, 3), np.float32), LearningRates())
 
     np.testing.assert_allclose(model.at(None), (2 * IDENTITY + model.of(9)) / 3, rtol=1e-6)
 
 
 def test_exposures_come_back_from_their_state():
-    model, again = exposures(), ExposureModel(LearningRates())
-    model.step(5, np.ones((2, 3), np.float32), 1.0)
+    model, again = exposures(), ExposureModel()
+    model.step(5, np.ones((2, 3), np.float32), LearningRates())
 
     again.restore(model.state())
     for each in (model, again):
-        each.step(5, np.full((2, 3), -0.5, np.float32), 1.0)
+        each.step(5, np.full((2, 3), -0.5, np.float32), LearningRates())
 
     np.testing.assert_array_equal(again.of(5), model.of(5))

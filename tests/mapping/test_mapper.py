@@ -13,7 +13,9 @@ from services.mapping.baking import BakedGaussians, MapCopy, bake
 from services.mapping.config import (
     AnchorConfig,
     DensificationConfig,
+    LearningRates,
     MappingConfig,
+    RefinementConfig,
     ScheduleConfig,
 )
 from services.mapping.pipeline import Mapper, NewKeyframe
@@ -271,6 +273,19 @@ def test_anchors_grow_in_the_first_part_of_a_refinement_only(calibration, insert
         sizes.append(len(mapper.anchors))
 
     assert sizes[0] < sizes[1] == sizes[2] == sizes[3]
+
+
+@pytest.mark.parametrize(("progress", "step"), [(0.0, 0.03), (0.5, 0.015)])
+def test_a_refinement_steps_at_rates_of_its_own_that_decay(calibration, insert, progress, step):
+    refinement = RefinementConfig(LearningRates(features=0.03), decay=0.25)
+    mapper = Mapper(calibration, MappingConfig(refinement=refinement), 0, torch.device("cpu"))
+    insert(mapper, 0)
+    before = mapper.anchors.rows["features"].clone()
+
+    mapper.refine(progress)
+
+    moved = (mapper.anchors.rows["features"] - before).abs().max()
+    assert float(moved) == pytest.approx(step, rel=1e-3)  # Adam's first step is its rate
 
 
 def test_a_keyframe_whose_image_is_damaged_is_refused_and_not_trained_on(
