@@ -31,6 +31,8 @@ class AnchorConfig:
     initial_opacity: float = 0.6
     initial_sigma: float = 0.6  # of the spacing of the depth samples
     primary_rate: float = 0.5  # of the secondary anchors' learning rate; 0.1 costs 0.2 to 0.3 dB
+    young_boost: float = 4.0  # a new anchor learns (1 + young_boost exp(-t / young_steps)) times
+    young_steps: float = 10.0  # as fast at its step t: it may have few, or many to settle in
     min_alpha: float = 0.5  # a pixel below this is not covered by the map
     min_depth_gap_m: float = 0.03  # measured depth this much in front, and by this share,
     min_depth_gap: float = 0.06  # is not covered
@@ -48,6 +50,8 @@ class AnchorConfig:
         _check(self.voxel_size_m > 0, "anchors.voxel_size_m must be positive")
         _check(self.reference_depth_m > 0, "anchors.reference_depth_m must be positive")
         _check(self.max_anchors > 0, "anchors.max_anchors must be positive")
+        _check(self.young_boost >= 0, "anchors.young_boost must not be negative")
+        _check(self.young_steps > 0, "anchors.young_steps must be positive")
         _check(self.carve_window_px % 2 == 1, "anchors.carve_window_px must be odd")
         _check(0 < self.initial_opacity < 1, "anchors.initial_opacity must be between 0 and 1")
 

@@ -22,37 +22,49 @@ _PIECE = 1024
 
 
 @dataclass(frozen=True)
+class Youth:
+    """How much wider rows step while they are young: 1 + `boost` exp(-t / `steps`)."""
+
+    boost: float = 0.0
+    steps: float = 10.0
+
+
+@dataclass(frozen=True)
 class RowStep:
     """One step of the rows that an iteration saw."""
 
     rows: RowTable
     index: Tensor  # [V], without repeats
-    rates: Tensor  # [V], of the row, over 1 - beta^t of the mean
+    rates: Tensor  # [V], of the row and its youth, over 1 - beta^t of the mean
     corrections: Tensor  # [V], 1 / (1 - beta^t) of the square
 
 
-def begin_step(rows: RowTable, index: Tensor) -> RowStep:
+def begin_step(rows: RowTable, index: Tensor, youth: Youth = Youth()) -> RowStep:
     """Count one more step for the rows `index` [V]."""
     if index.device.type == "cpu":
         rates, corrections = torch.empty(len(index)), torch.empty(len(index))
         columns = rows["steps"].numpy(), rows["rate"].numpy()
-        _begin_kernel(index.numpy(), columns, rates.numpy(), corrections.numpy())
+        young = youth.boost, youth.steps
+        _begin_kernel(index.numpy(), columns, young, rates.numpy(), corrections.numpy())
         return RowStep(rows, index, rates, corrections)
     steps = rows["steps"][index] + 1
     rows["steps"][index] = steps
     t = steps.double()
-    rates = rows["rate"][index] / (1.0 - BETA_MEAN**t)
+    young = 1.0 + youth.boost * torch.exp(-t / youth.steps)
+    rates = rows["rate"][index] * young / (1.0 - BETA_MEAN**t)
     return RowStep(rows, index, rates.float(), (1.0 / (1.0 - BETA_SQUARE**t)).float())
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _begin_kernel(index, columns, rates, corrections):  # pragma: no cover - compiled
-    """Count a step of each row; rates and corrections as in `RowStep`."""
+def _begin_kernel(index, columns, young, rates, corrections):  # pragma: no cover - compiled
+    """Count a step of each row; rates and corrections as in `RowStep`, `young` as in `Youth`."""
     steps, row_rates = columns
+    boost, span = young
     for row in range(index.size):
         i = index[row]
         steps[i] += 1
-        rates[row] = row_rates[i] / (1.0 - BETA_MEAN ** steps[i])
+        youth = 1.0 + boost * np.exp(-steps[i] / span)
+        rates[row] = row_rates[i] * youth / (1.0 - BETA_MEAN ** steps[i])
         corrections[row] = 1.0 / (1.0 - BETA_SQUARE ** steps[i])
 
 

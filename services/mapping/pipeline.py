@@ -6,7 +6,6 @@ thread may ask for renders.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -34,7 +33,8 @@ from services.mapping.map_state import (
     flatten,
     unflatten,
 )
-from services.mapping.optimizer import adam_rows, begin_step
+from services.mapping.optimizer import Youth, adam_rows, begin_step
+from services.mapping.placement import Placement
 from services.mapping.rasterizer import View, rasterizer_for
 from services.mapping.render import Drawn, Painter, to_images
 from services.mapping.render_cache import Moment
@@ -87,7 +87,8 @@ class Mapper:
             calibration, config.schedule, seed, lambda image: Target.of(image, device)
         )
         self.sightings = Sightings(calibration)
-        self._placed: dict[int, NDArray[np.float64]] = {}  # poses that the anchors are placed by
+        self._placement = Placement(config.schedule)
+        self._youth = Youth(config.anchors.young_boost, config.anchors.young_steps)
         self._loss = mapping_loss_cpu if device.type == "cpu" else mapping_loss
         self._rng = np.random.default_rng([seed, 0])
         self._background = np.zeros(3, np.float32)
@@ -176,8 +177,7 @@ class Mapper:
             "mapper": as_tensors(
                 {
                     "background": self._background,
-                    "placed_seqs": np.array(list(self._placed), np.int64),
-                    "placed": np.array(list(self._placed.values())).reshape(-1, 4, 4),
+                    **self._placement.state(),
                     "squared_errors": np.array(self._squared_errors, np.float64),
                 }
             ),
@@ -199,24 +199,21 @@ class Mapper:
         self.exposures.restore(as_arrays(groups["exposures"]))
         mapper = as_arrays(groups["mapper"])
         self._background = mapper["background"].copy()
-        placed = mapper["placed"].copy()  # else each pose would keep the whole file in memory
-        self._placed = dict(zip(mapper["placed_seqs"].tolist(), placed, strict=True))
+        self._placement.restore(mapper)
         self._squared_errors.extend(mapper["squared_errors"].tolist())
         self.iterations = state.values["iterations"]
         self.revision = state.values["revision"]
         self._rng.bit_generator.state = state.values["generator"]
         self.views.restore(state.values["views"], frames)
 
-    def _step(
-        self, keyframe: TrainingView, rates: LearningRates, progress: float = 0.0
-    ) -> None:
+    def _step(self, keyframe: TrainingView, rates: LearningRates, progress: float = 0.0) -> None:
         """One optimisation step on one keyframe, at 0 <= `progress` < 1 of a refinement."""
         with self.stages.stage("target"):
             target = self.views.target(keyframe.seq)
         exposure = torch.from_numpy(self.exposures.of(keyframe.seq)).to(self._device)
         appearance = self._appearance(exposure.requires_grad_())
         with self.stages.stage("iteration"):
-            drawn = self._draw(keyframe, target)
+            drawn = self._draw(View(se3.inverse(keyframe.T_world_camera), target.intrinsics))
             if len(drawn.visible.index) == 0:  # a keyframe without depth, far from the map
                 return
             with self.stages.stage("loss"):
@@ -232,8 +229,7 @@ class Mapper:
                 self._densify(drawn, progress)
         self._squared_errors.append(float(loss.squared_error))
 
-    def _draw(self, keyframe: TrainingView, target: Target) -> Drawn:
-        view = View(se3.inverse(keyframe.T_world_camera), target.intrinsics)
+    def _draw(self, view: View) -> Drawn:
         with self.stages.stage("decode"):
             visible, gaussians = self.painter.decode(view, is_trained=True)
         with self.stages.stage("rasterize"):
@@ -243,7 +239,7 @@ class Mapper:
     def _update(self, drawn: Drawn, rates: LearningRates) -> None:
         """Adam over the visible anchors and the networks."""
         self._environment.step(self.anchors, drawn.visible, rates)
-        step = begin_step(self.anchors.rows, drawn.visible.index)
+        step = begin_step(self.anchors.rows, drawn.visible.index, self._youth)
         for name in trained_widths(self.config.anchors):
             gradient = getattr(drawn.visible, name).grad
             adam_rows(step, name, gradient, getattr(rates, name))
@@ -268,24 +264,17 @@ class Mapper:
 
     def _follow_corrections(self, poses: KeyframePoses) -> None:
         """Where a keyframe was corrected, its anchors go with it."""
-        for seq, T_new in zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True):
-            if seq not in self.views:
-                continue
-            self.views.set_pose(seq, T_new)
-            T_new_old = T_new @ se3.inverse(self._placed[seq])
-            shift = float(np.linalg.norm(T_new[:3, 3] - self._placed[seq][:3, 3]))
-            turn = math.degrees(se3.angle_rad(T_new_old))
-            schedule = self.config.schedule
-            if shift > schedule.min_shift_m or turn > schedule.min_turn_deg:
-                self.anchors.move(seq, T_new_old)
-                self._placed[seq] = T_new
+        for seq, T_world_camera in zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True):
+            if seq in self.views:
+                self.views.set_pose(seq, T_world_camera)
+                self._placement.follow(seq, T_world_camera, self.anchors)
 
     def _add_view(self, keyframe: NewKeyframe) -> RgbdImage:
         frame = keyframe.frame
         view = TrainingView(frame.seq, frame.t_ns, frame, keyframe.T_world_camera)
         image = self.views.add(view)
         self.sightings.add(frame.seq, image)
-        self._placed[frame.seq] = keyframe.T_world_camera
+        self._placement.add(frame.seq, keyframe.T_world_camera)
         self.exposures.add(frame.seq, frame.t_ns)
         mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
         self._background += (mean - self._background) / len(self.views)

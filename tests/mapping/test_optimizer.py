@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from services.mapping.optimizer import adam_rows, adam_rows_torch, begin_step
+from services.mapping.optimizer import Youth, adam_rows, adam_rows_torch, begin_step
 from services.mapping.rows import RowTable
 
 COLUMN = ((3,), torch.float32)
@@ -78,3 +80,19 @@ def test_a_rows_own_rate_scales_its_steps():
     adam_rows(begin_step(rows, torch.arange(2)), "x", torch.ones(2, 3), 0.1)
 
     torch.testing.assert_close((before - rows["x"])[:, 0], torch.tensor([0.1, 0.01]))
+
+
+@pytest.mark.parametrize("function", [adam_rows, adam_rows_torch])
+def test_young_rows_step_wider_and_settle(function):
+    rows, gradient = table(2), torch.ones(1, 3)
+    youth = Youth(boost=3.0, steps=2.0)
+    moves = []
+
+    for _ in range(9):
+        before = rows["x"][0, 0].clone()
+        function(begin_step(rows, torch.tensor([0]), youth), "x", gradient, 0.1)
+        moves.append(float(before - rows["x"][0, 0]))
+
+    # Under a constant slope, plain Adam moves by its rate.
+    expected = [0.1 * (1 + 3 * math.exp(-t / 2)) for t in range(1, 10)]
+    assert moves == pytest.approx(expected, rel=1e-3)
