@@ -18,8 +18,10 @@ from services.tracking.verification import Agreement, depth_agreement
 from shared.se3 import angle_rad, inverse
 from shared.tracks import NO_LANDMARK
 
-_SAME_M = 5e-4
+_SAME_M = 5e-4  # planes of the map
 _SAME_RAD = 5e-4
+_MATCHES_SAME_M = 5e-3  # features: some pixels, of the ten that they are looked for in
+_MATCHES_SAME_RAD = 5e-3
 
 
 @dataclass(frozen=True)
@@ -100,40 +102,48 @@ def attempt(
 class _Refined:
     refinement: Refinement
     matches: Matches
-    registration: Registration  # linearised at the refined pose
+    registration: Registration  # linearised where the refinement began, at most a small step away
 
 
 def _refine_until_still(
     observed: Observed, local: LocalMap, registration: Registration, config: TrackingConfig
 ) -> _Refined:
-    """Refine; where that moved the pose, find matches and correspondences anew and repeat."""
-    refined = _refine(observed, local, registration, config)
+    """Refine; where that moved the pose, find correspondences anew and repeat."""
+    matches = _matches(observed, local, registration.T_world_camera, config)
+    refinement = _refine(observed, local, registration, matches, config)
     for _ in range(config.refinement.max_relinearisations - 1):
-        step = inverse(registration.T_world_camera) @ refined.refinement.T_world_camera
-        if _is_small(step):
+        T = refinement.T_world_camera
+        step = inverse(registration.T_world_camera) @ T
+        if _is_within(step, _SAME_M, _SAME_RAD):
             break
-        registration = refined.registration
-        refined = _refine(observed, local, registration, config)
-    return refined
+        if not _is_within(step, _MATCHES_SAME_M, _MATCHES_SAME_RAD):
+            matches = _matches(observed, local, T, config)
+        registration = linearise(observed.cloud, local.voxels.levels[-1], T, config.registration)
+        refinement = _refine(observed, local, registration, matches, config)
+    return _Refined(refinement, matches, registration)
 
 
-def _is_small(step: NDArray[np.float64]) -> bool:
-    """Whether correspondences would stay the same after this step."""
-    return float(np.linalg.norm(step[:3, 3])) < _SAME_M and angle_rad(step) < _SAME_RAD
+def _is_within(step: NDArray[np.float64], metres: float, radians: float) -> bool:
+    """Whether what corresponds would stay the same after this step."""
+    return float(np.linalg.norm(step[:3, 3])) < metres and angle_rad(step) < radians
+
+
+def _matches(
+    observed: Observed, local: LocalMap, T: NDArray[np.float64], config: TrackingConfig
+) -> Matches:
+    landmarks = local.context.landmarks
+    return match_by_projection(observed.features, landmarks, T, observed.intrinsics, config.orb)
 
 
 def _refine(
-    observed: Observed, local: LocalMap, registration: Registration, config: TrackingConfig
-) -> _Refined:
-    """Match around a registered pose and minimise both errors together."""
-    landmarks = local.context.landmarks
-    T, intrinsics = registration.T_world_camera, observed.intrinsics
-    matches = match_by_projection(observed.features, landmarks, T, intrinsics, config.orb)
-    observations = pose_observations(observed.features, landmarks, matches, config.refinement)
-    refinement = refine_pose(observations, registration, T, intrinsics, config.refinement)
-    finest = local.voxels.levels[-1]
-    return _Refined(
-        refinement,
-        matches,
-        linearise(observed.cloud, finest, refinement.T_world_camera, config.registration),
-    )
+    observed: Observed,
+    local: LocalMap,
+    registration: Registration,
+    matches: Matches,
+    config: TrackingConfig,
+) -> Refinement:
+    """Minimise the errors of features and registration together."""
+    settings = config.refinement
+    observations = pose_observations(observed.features, local.context.landmarks, matches, settings)
+    T = registration.T_world_camera
+    return refine_pose(observations, registration, T, observed.intrinsics, settings)

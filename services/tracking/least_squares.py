@@ -22,6 +22,8 @@ from shared.camera import Intrinsics
 from shared.se3 import inverse, transform
 from shared.tracks import Landmarks
 
+_STILL = 1e-5  # metres and radians: a step that ends the iterations
+
 
 @dataclass(frozen=True)
 class PoseObservations:
@@ -152,7 +154,7 @@ def _minimise(  # noqa: PLR0913 - compiled
             damping *= 10.0
             continue
         T, H, b, cost, damping = T_new, H_new, b_new, cost_new, damping * 0.3
-        if np.abs(twist).max() < 1e-6:
+        if np.abs(twist).max() < _STILL:
             break
     return T
 
@@ -175,7 +177,7 @@ def _with_prior(  # noqa: PLR0913 - compiled
     return H, b, cost
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(  # noqa: C901 - compiled
     observations, is_used, T, camera, huber
 ):  # pragma: no cover - compiled

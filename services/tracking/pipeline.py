@@ -219,7 +219,7 @@ def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
 
 
 def _median_depth(observed: Observed) -> float:
-    depths = observed.cloud.points[:, 2]
+    depths = observed.cloud.points[::8, 2]
     return float(np.median(depths)) if len(depths) else 1.0
 
 
