@@ -57,6 +57,7 @@ class LaunchOptions:
     http_port: int = 0
     grpc_port: int = 0
     num_mappers: int = 1
+    traces: str = ""  # where spans go, as the services' --traces
     access: Access = field(default_factory=Access)
     settings: ServiceSettings = field(default_factory=ServiceSettings)
 
@@ -145,7 +146,7 @@ class Services:
     def _commands(self, options: LaunchOptions, router: str) -> list[Command]:
         def command(role: str, name: str, *arguments: str) -> Command:
             settings = options.settings.arguments(role)
-            common = ("--connect", router, "--id", name)
+            common = ("--connect", router, "--id", name, "--traces", options.traces)
             return Command(name, role, f"services.{role}", (*common, *arguments, *settings))
 
         trackers = [f"tracker-{i}" for i in range(options.num_trackers)]

@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from shared import codec
+from shared import codec, tracing
 from shared.errors import ConfigError, GoneError, InputError, UnavailableError
 from shared.fabric import BusConfig, RouterConfig, answers, client_config, router_config
 from shared.keys import Keys
@@ -106,6 +106,7 @@ class Bus:
         replies = self._session.get(
             key,
             payload=codec.pack(message),
+            attachment=tracing.outgoing() or None,
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
             priority=Keys.priority(key),
@@ -134,6 +135,7 @@ class Bus:
             key,
             handler,
             payload=codec.pack(message),
+            attachment=tracing.outgoing() or None,
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
             priority=Keys.priority(key),

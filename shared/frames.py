@@ -119,5 +119,4 @@ class TrackRequest:
     frame: Frame
     prior: Prior | None  # None: no frame of this session has a pose yet
     T_world_first: NDArray[np.float64]  # [4, 4], pose of the session's first frame
-    traceparent: str = ""
     accepts_older_map: bool = False  # live: where the map's owner is absent, what is cached will do

@@ -58,6 +58,14 @@ class Keys:
         return f"{ROOT}/alive/{role}/{name}"
 
     @staticmethod
+    def fields(key: str) -> dict[str, str | int]:
+        """Session and epoch that a key is about, for the log."""
+        parts = key.split("/")
+        if len(parts) < 5 or parts[2] != "session" or not parts[4].isdecimal():
+            return {}
+        return {"session": parts[3], "epoch": int(parts[4])}
+
+    @staticmethod
     def priority(key: str) -> Priority:
         """Of a question and its answer: what a camera waits for before what a person waits for."""
         return _PRIORITIES.get(key.rpartition("/")[2], Priority.DATA)

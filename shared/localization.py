@@ -33,7 +33,6 @@ class LocalizeRequest:
     rgb: ColourImage
     depth: DepthImage | None = None
     T_world_prior: NDArray[np.float64] | None = None  # [4, 4], where the camera is thought to be
-    traceparent: str = ""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 
-from prometheus_client import Counter, Histogram, start_http_server
+from prometheus_client import Counter, Gauge, Histogram, start_http_server
 
 from shared.errors import UnavailableError
 
@@ -20,6 +20,11 @@ _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5,
 def counter(name: str, text: str, *labels: str) -> Counter:
     """A number that only grows; Prometheus appends `_total`."""
     return Counter(f"pointslam_{name}", text, labels)
+
+
+def gauge(name: str, text: str, *labels: str) -> Gauge:
+    """A number that goes up and down."""
+    return Gauge(f"pointslam_{name}", text, labels)
 
 
 def seconds(name: str, text: str, *labels: str) -> Histogram:

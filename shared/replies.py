@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,10 @@ from shared.errors import (
     TimedOutError,
     UnavailableError,
 )
+from shared.keys import Keys
+from shared.tracing import log_fields, span
 
+_MAX_ATTACHMENT = 200  # a traceparent has 55 bytes
 LOGGER = logging.getLogger(__name__)
 
 _ERRORS: dict[str, type[PointSlamError]] = {
@@ -62,9 +66,24 @@ def read_reply(reply: zenoh.Reply, key: str, kind: type) -> Any:
     raise _ERRORS.get(failure.code, PointSlamError)(failure.text)
 
 
+@contextmanager
+def _answering(key: str, traceparent: str) -> Iterator[None]:
+    if not traceparent:
+        yield
+        return
+    _, _, about, *_, question = key.split("/")
+    with span(f"{about} {question}", traceparent):
+        yield
+
+
 def answer_query(query: zenoh.Query, key: str, kind: type, answer: Callable[[Any], object]) -> None:
-    """Reply to a query with what `answer` returns or raises; always finishes the query."""
-    with query:
+    """Reply to a query with what `answer` returns or raises; always finishes the query.
+
+    Log lines say whose map it is about, and a query of a trace is answered in a span of its own.
+    """
+    attached = query.attachment
+    traceparent = attached.to_bytes()[:_MAX_ATTACHMENT].decode(errors="replace") if attached else ""
+    with query, log_fields(**Keys.fields(key)), _answering(key, traceparent):
         try:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             query.reply(key, codec.pack(answer(codec.unpack(kind, payload))))

@@ -18,6 +18,7 @@ from typing import TypeVar
 from shared.config import override, read_overrides
 from shared.errors import ConfigError, PointSlamError
 from shared.fabric import BusConfig
+from shared.tracing import add_tracing_arguments, present_fields
 
 C = TypeVar("C")
 
@@ -37,6 +38,7 @@ def service_arguments(description: str | None) -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting, dotted key"
     )
     parser.add_argument("--json-log", action="store_true", help="one JSON object a line")
+    add_tracing_arguments(parser)
     return parser
 
 
@@ -66,24 +68,27 @@ def endpoints(arguments: argparse.Namespace) -> list[str]:
     return arguments.connect or ["tcp/127.0.0.1:7447"]
 
 
-class _JsonFormatter(logging.Formatter):
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line, with what `log_fields` says."""
+
     def format(self, record: logging.LogRecord) -> str:
         line = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)),
             "level": record.levelname,
             "logger": record.name,
             "message": record.getMessage(),
+            **present_fields(),
         }
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line)
+        return json.dumps(line, default=str)
 
 
 def setup_logging(as_json: bool = False) -> None:
     """Log to standard error, one line an event."""
     handler = logging.StreamHandler(sys.stderr)
     text = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
-    handler.setFormatter(_JsonFormatter() if as_json else text)
+    handler.setFormatter(JsonFormatter() if as_json else text)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
 
 

@@ -33,7 +33,10 @@ class PriorMessage:
 
 @dataclass(frozen=True)
 class FrameMessage:
-    """One frame on the wire. Flags: `no_keyframe` (track it, never put it into the map)."""
+    """One frame on the wire. Flags: `no_keyframe` (track it, never put it into the map).
+
+    `traceparent` (W3C) makes its way through the services part of the client's trace.
+    """
 
     seq: int
     t_ns: int
@@ -41,6 +44,7 @@ class FrameMessage:
     depth: DepthMessage
     prior: PriorMessage | None = None
     flags: tuple[str, ...] = ()
+    traceparent: str = ""
 
     def frame(self) -> Frame:
         """The frame as the services pass it on."""

@@ -21,11 +21,13 @@ JPEG_QUALITY = 95
 class FrameOptions:
     """What may be said about a frame besides its images.
 
-    `T_odom_camera`, [4, 4], is the device's own odometry in a smooth frame of its own.
+    `T_odom_camera`, [4, 4], is the device's own odometry in a smooth frame of its own;
+    `traceparent` (W3C) makes the frame part of a trace.
     """
 
     may_be_keyframe: bool = True
     T_odom_camera: NDArray[np.float64] | None = None
+    traceparent: str = ""
 
 
 def frame_message(
@@ -45,6 +47,7 @@ def frame_message(
         depth=_depth(depth),
         prior=None if T_odom is None else PriorMessage(Pose.from_matrix(T_odom)),
         flags=() if options.may_be_keyframe else (NO_KEYFRAME,),
+        traceparent=options.traceparent,
     )
 
 

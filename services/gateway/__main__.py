@@ -32,6 +32,7 @@ from shared.service import (
     settings_from,
     setup_logging,
 )
+from shared.tracing import setup_tracing
 
 _UNREAD_MS = 30_000
 
@@ -58,6 +59,7 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     limit_blas_threads()
     setup_logging(arguments.json_log)
+    setup_tracing("gateway", arguments)
     config = settings_from(arguments, GatewayConfig())
     authority, tls = authority_from(arguments, config.access), tls_from(arguments)
     door = GrpcDoor(arguments.http_host, arguments.grpc_port, authority, tls)

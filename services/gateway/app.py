@@ -38,7 +38,9 @@ too much at once (see Retry-After)."""
 def open_sessions(bus: Bus, config: GatewayConfig, name: str = "gateway") -> Sessions:
     """The sessions of a gateway on this bus; call it on the event loop."""
     trackers = TrackerPool(bus, Members(bus, "tracking"), config.dispatch)
-    return Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config, name))
+    sessions = Sessions(Fabric(bus, trackers, Members(bus, "mapping"), config, name))
+    sessions.measure()
+    return sessions
 
 
 def create_app(sessions: Sessions, authority: Authority) -> FastAPI:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
+from contextvars import Context
 
 from services.gateway.config import MappingConfig
 from services.gateway.owner import MapOwner
@@ -15,6 +16,7 @@ from shared.errors import (
     PointSlamError,
     UnavailableError,
 )
+from shared.tracing import outgoing, under
 from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
@@ -30,7 +32,7 @@ class Delivery:
     def __init__(self, owner: MapOwner, config: MappingConfig) -> None:
         self._owner = owner
         self._config = config
-        self._entries: deque[Advance] = deque()
+        self._entries: deque[tuple[Advance, str]] = deque()  # with their traces
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Condition()
         self._failure: PointSlamError | None = None
@@ -52,9 +54,10 @@ class Delivery:
                 if self._failure is not None:
                     raise self._failure
                 await self._changed.wait()
-        self._entries.append(entry)
+        self._entries.append((entry, outgoing()))
         if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._send_all())
+            # In no frame's context: it sends those of others too.
+            self._task = asyncio.create_task(self._send_all(), context=Context())
 
     async def flush(self, timeout_s: float) -> bool:
         """Wait until all entries are acknowledged; false when the time was over first."""
@@ -68,7 +71,7 @@ class Delivery:
     @property
     def holds_keyframe(self) -> bool:
         """Whether a keyframe waits that trackers cannot see in the map yet."""
-        return any(entry.keyframe is not None for entry in self._entries)
+        return any(entry.keyframe is not None for entry, _ in self._entries)
 
     @property
     def problem(self) -> PointSlamError | None:
@@ -106,17 +109,19 @@ class Delivery:
 
     async def _send_all(self) -> None:
         while self._entries:
+            entry, traceparent = self._entries[0]
             try:
-                if self._entries[0].record.seq > self._owner.logged_seq:
-                    await self._owner.advance(self._entries[0])
+                if entry.record.seq > self._owner.logged_seq:
+                    with under(traceparent):
+                        await self._owner.advance(entry)
             except ClaimLostError as error:
                 self._forget()
                 await self._tell(error)
                 return
             except (InputError, ConflictError) as error:
                 # It would be refused for ever, and everything behind it would wait.
-                seq = self._entries[0].record.seq
-                LOGGER.error("%s: frame %d is not in the map: %s", self._owner.session, seq, error)
+                name, seq = self._owner.session, entry.record.seq
+                LOGGER.error("%s: frame %d is not in the map: %s", name, seq, error)
             except PointSlamError as error:
                 if str(error) != str(self._failure):
                     LOGGER.warning("%s: map entry not taken: %s", self._owner.session, error)

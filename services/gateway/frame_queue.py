@@ -75,6 +75,11 @@ class FrameQueue:
         """Whether no frame waits or is under way."""
         return self._in_flight is None and not self._waiting
 
+    @property
+    def age_s(self) -> float:
+        """Since when the oldest unanswered frame is here; 0 without one."""
+        return 0.0 if self._in_flight is None else time.perf_counter() - self._in_flight.since_s
+
     async def finish(self) -> None:
         """Wait until every admitted frame is answered."""
         if self._task is not None:

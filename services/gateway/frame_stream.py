@@ -46,7 +46,7 @@ class FrameStream:
         writer = asyncio.create_task(self._write())
         reader = asyncio.create_task(self._read(read))
         try:
-            with self._session.in_use():
+            with self._session.usage.held():
                 await asyncio.wait({writer, reader}, return_when=asyncio.FIRST_COMPLETED)
             if not writer.done():
                 reader.result()

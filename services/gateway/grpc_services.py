@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
 
 import grpc
@@ -32,7 +33,7 @@ from services.gateway.wire_values import (
 )
 from shared.errors import InputError
 from shared.maps import ExportFormat, RenderRequest
-from shared.stream import FrameReply
+from shared.stream import FrameMessage, FrameReply
 from shared.wire import (
     map_service_pb2,
     map_service_pb2_grpc,
@@ -155,11 +156,15 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
                 return
             session = await self._sessions.get(first.session_id)
 
+            traceparent = dict(context.invocation_metadata()).get("traceparent", "")
+
             async def read(frames: FrameStream) -> None:
-                await frames.put(lambda: _frame(first, session), lambda: _numbers(first))
+                await frames.put(
+                    lambda: _frame(first, session, traceparent), lambda: _numbers(first)
+                )
                 async for request in requests:
                     await frames.put(
-                        lambda request=request: _frame(request, session),
+                        lambda request=request: _frame(request, session, traceparent),
                         lambda request=request: _numbers(request),
                     )
 
@@ -181,11 +186,11 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
             return localized_to(await session.localize(message))
 
 
-def _frame(request: Any, session: Session) -> Any:
+def _frame(request: Any, session: Session, traceparent: str) -> FrameMessage:
     current_caller().budget.take_frame()
     if request.session_id not in ("", session.name):
         raise InputError("session_id", f"this stream is of session {session.name}")
-    message = frame_from(require(request, "frame"))
+    message = replace(frame_from(require(request, "frame")), traceparent=traceparent)
     check_frame(message, session.calibration)
     return message
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -63,6 +64,8 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
         session = await sessions.get(name)
         current_caller().budget.take_frame()
         message = read_frame(await request.body(), session.calibration)
+        traceparent = message.traceparent or request.headers.get("traceparent", "")
+        message = replace(message, traceparent=traceparent)
         return _reply(request, await session.track(message))
 
     @router.post("/v1/sessions/{name}/localize", openapi_extra=examples.LOCALIZE)

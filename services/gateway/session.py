@@ -6,8 +6,7 @@ import asyncio
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 from services.gateway.access.tenants import public_name
@@ -21,11 +20,13 @@ from services.gateway.owner import Fabric, MapOwner
 from services.gateway.pose_feed import PoseFeed
 from services.gateway.poses import TimedPose, record_of
 from services.gateway.prior import next_prior, resumed_prior
+from services.gateway.usage import Usage
 from shared.bus import Keys
 from shared.errors import ClaimLostError, PointSlamError, UnavailableError
 from shared.frames import Frame, TrackRequest
 from shared.localization import LocalizeMessage, LocalizeReply
 from shared.stream import FrameMessage, FrameReply
+from shared.tracing import log_fields, span
 from shared.tracks import (
     Advance,
     Advanced,
@@ -51,11 +52,10 @@ class Session:
         self._T_world_first = opened.T_world_first
         self._delivery = Delivery(self.owner, fabric.config.mapping)
         self.poses = PoseFeed(fabric.config.stream)
-        waiting = fabric.config.limits.max_waiting_frames
-        self._frames = FrameQueue(self._answer, self.is_live, waiting)
+        room = fabric.config.limits.max_waiting_frames
+        self._frames = FrameQueue(self._answer, self.is_live, room)
         self._localizer = Localizer(fabric, self.owner, self.calibration)
-        self._users = 0
-        self._used_s = time.monotonic()
+        self.usage = Usage()
         self._claim = 0  # the number of ours; 0 while another gateway may advance the session
         self._claiming = asyncio.Lock()
         self._take_up(opened)
@@ -89,36 +89,25 @@ class Session:
         timeout_s = self._fabric.config.mapping.question_timeout_s
         return await self.owner.ask("claim", request, ClaimReply, timeout_s)
 
-    @contextmanager
-    def in_use(self) -> Iterator[None]:
-        """Keep this session open while the block runs."""
-        self._users += 1
-        try:
-            yield
-        finally:
-            self._users -= 1
-            self.touch()
-
-    def touch(self) -> None:
-        """Note that somebody asked for it."""
-        self._used_s = time.monotonic()
-
     def is_idle(self, idle_s: float) -> bool:
         """Whether nobody has used it for so long, and nothing is under way."""
-        is_busy = (
-            self._users or self.poses.is_watched or self._delivery or not self._frames.is_empty
-        )
-        return not is_busy and time.monotonic() - self._used_s > idle_s
+        is_busy = self.poses.is_watched or self._delivery or not self._frames.is_empty
+        return not is_busy and self.usage.idle_s > idle_s
+
+    @property
+    def undelivered(self) -> int:
+        """Answered frames that the map's owner has not acknowledged."""
+        return len(self._delivery)
+
+    @property
+    def frame_age_s(self) -> float:
+        """Since when its oldest unanswered frame waits or is under way."""
+        return self._frames.age_s
 
     def submit(self, message: FrameMessage) -> asyncio.Future[Outcome]:
-        """Queue a checked frame.
-
-        Raises:
-            ClaimLostError: another gateway advances the session; `claim` it first.
-            PointSlamError: as `FrameQueue.submit`.
-        """
+        """Queue a checked frame; raises as `FrameQueue.submit`, or ClaimLostError without one."""
         self._require_claim()
-        self.touch()
+        self.usage.touch()
         return self._frames.submit(message)
 
     async def track(self, message: FrameMessage) -> FrameReply:
@@ -176,14 +165,13 @@ class Session:
 
     def state(self) -> dict[str, Any]:
         """The tracking side of the session as plain values."""
-        seq, t_ns = self.poses.newest
         prior = self._prior
         return {
-            "last_seq": seq,
-            "last_t_ns": t_ns,
+            "last_seq": self.poses.newest[0],
+            "last_t_ns": self.poses.newest[1],
             "lost_frames": prior.lost_frames if prior else 0,
             "newest_keyframe_seq": prior.newest_keyframe_seq if prior else -1,
-            "undelivered": len(self._delivery),
+            "undelivered": self.undelivered,
         }
 
     async def flush(self, timeout_s: float) -> bool:
@@ -200,6 +188,14 @@ class Session:
         self._fabric.trackers.release(self.owner.session)
 
     async def _answer(self, message: FrameMessage, waited_ms: float) -> FrameReply:
+        name = self.owner.session
+        with (
+            log_fields(session=name, epoch=self.owner.epoch, seq=message.seq),
+            span("frame", message.traceparent, session=name, seq=message.seq),
+        ):
+            return await self._track_and_deliver(message, waited_ms)
+
+    async def _track_and_deliver(self, message: FrameMessage, waited_ms: float) -> FrameReply:
         self._require_claim()
         start = time.perf_counter()
         frame = message.frame()

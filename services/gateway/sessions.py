@@ -14,6 +14,7 @@ import numpy as np
 from services.gateway.access.tenants import SESSION_NAME, full_name, is_callers, public_name
 from services.gateway.decode import matrix_of
 from services.gateway.dispatch import choose
+from services.gateway.metrics import QUEUE_AGE, SESSIONS, UNDELIVERED
 from services.gateway.owner import Fabric, open_existing, open_new
 from services.gateway.session import Session
 from shared import codec
@@ -110,8 +111,17 @@ class Sessions:
                 if name not in self._open:
                     self._open[name] = Session(self.fabric, await self._resume(name))
         session = self._open[name]
-        session.touch()
+        session.usage.touch()
         return session
+
+    def measure(self) -> None:
+        """Tell Prometheus of all sessions whenever it asks."""
+        QUEUE_AGE.set_function(lambda: max((s.frame_age_s for s in self._all()), default=0.0))
+        UNDELIVERED.set_function(lambda: sum(s.undelivered for s in self._all()))
+        SESSIONS.set_function(lambda: len(self._open))
+
+    def _all(self) -> tuple[Session, ...]:
+        return tuple(self._open.values())
 
     async def forget_idle(self) -> None:
         """Keep memory bounded, for ever: what nobody uses is closed; `get` takes it up again."""

@@ -25,6 +25,7 @@ from shared.service import (
     setup_logging,
     stop_event,
 )
+from shared.tracing import setup_tracing
 
 
 def device_named(name: str) -> torch.device:
@@ -48,6 +49,7 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     stop = stop_event()
     setup_logging(arguments.json_log)
+    setup_tracing("mapping", arguments)
     limit_blas_threads()
     settings = MapperSettings(
         name=arguments.id,

@@ -44,3 +44,14 @@ class SessionCollector(Collector):
             for info in infos:
                 family.add_metric((info.session,), float(value(info)))
             yield family
+        yield _stages(infos)
+
+
+def _stages(infos: Iterable[MapInfo]) -> Metric:
+    labels = ("session", "stage")
+    text = "Median time of a step of the optimization by stage"
+    family = GaugeMetricFamily("pointslam_map_stage_seconds", text, labels=labels)
+    for info in infos:
+        for stage, milliseconds in info.stages_ms.items():
+            family.add_metric((info.session, stage), milliseconds / 1e3)
+    return family

@@ -40,6 +40,7 @@ from shared.maps import (
     RenderRequest,
     SaveReply,
 )
+from shared.tracing import log_fields
 from shared.tracks import (
     Advance,
     Advanced,
@@ -142,7 +143,7 @@ class Session:
             InputError, ConflictError, StorageError: as `Ledger.append`.
             SteppedDownError: another mapper may own the session by now; nothing is acknowledged.
         """
-        with self._calm:
+        with log_fields(seq=entry.record.seq), self._calm:
             self._lease.check()
             self._claims.check(entry.claim)
             if not self.ledger.holds(entry.record.seq):

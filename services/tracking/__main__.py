@@ -31,6 +31,7 @@ from shared.service import (  # noqa: E402
     setup_logging,
     stop_event,
 )
+from shared.tracing import setup_tracing  # noqa: E402
 
 
 def main(argv: list[str]) -> None:
@@ -43,6 +44,7 @@ def main(argv: list[str]) -> None:
     add_metrics_arguments(parser)
     arguments = parser.parse_args(argv)
     setup_logging(arguments.json_log)
+    setup_tracing("tracking", arguments)
     config = settings_from(arguments, TrackingConfig())
     stop = stop_event()
     cv2.setNumThreads(1)  # frames of several sessions are what runs side by side

@@ -9,6 +9,8 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import copy_context
+from functools import partial
 from typing import Any
 
 from services.tracking import metrics
@@ -20,6 +22,7 @@ from shared.bus import Bus, Keys
 from shared.errors import UnavailableError
 from shared.frames import TrackRequest
 from shared.localization import LocalizeRequest, LocalizeResult
+from shared.tracing import log_fields
 from shared.tracks import (
     Candidates,
     CandidatesRequest,
@@ -87,7 +90,8 @@ class BusSource:
 
         Those of its loop candidates come after: the next keyframe will want them.
         """
-        fetched = executor.submit(self._with_loop_maps, reference_seq, executor)
+        fetch = partial(copy_context().run, self._with_loop_maps)
+        fetched = executor.submit(fetch, reference_seq, executor)
         self._ahead[reference_seq, False] = fetched
 
     def _with_loop_maps(self, reference_seq: int, executor: Executor) -> LocalMap:
@@ -168,7 +172,9 @@ class Worker:
         request.calibration.check()
         source = BusSource(self._bus, request, self._cache, self._config)
         source.fetch_ahead(request.prior.reference_seq if request.prior else -1, self._fetching)
-        result = track(request, source, self._config, self._helpers)
+        about = {"session": request.session, "epoch": request.epoch, "seq": request.frame.seq}
+        with log_fields(**about):
+            result = track(request, source, self._config, self._helpers)
         metrics.count(result)
         return result
 

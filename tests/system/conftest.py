@@ -13,5 +13,7 @@ from pointslam.launcher import LaunchOptions, Services
 def services(tmp_path_factory) -> Iterator[Services]:
     """A router, a gateway, two trackers and a mapper; who kills one of them restarts it."""
     folder = tmp_path_factory.mktemp("services")
-    with Services(LaunchOptions(folder / "data", folder / "logs", device="cpu")) as started:
+    traces = f"file:{folder / 'traces'}"
+    options = LaunchOptions(folder / "data", folder / "logs", device="cpu", traces=traces)
+    with Services(options) as started:
         yield started
