@@ -41,6 +41,8 @@ class Recorder:
         except ImportError as error:
             raise ConfigError(f"{INSTALL} ({error})") from None
         self._calibration = calibration
+        is_apart = not np.array_equal(calibration.T_colour_depth, np.eye(4))
+        self._depth_frame = "depth" if is_apart else _CAMERA
         self._file = path.open("wb")
         self._writer = Writer(self._file)
         kept = {"depth_scale": calibration.depth_scale}
@@ -64,17 +66,25 @@ class Recorder:
         Raises:
             InputError: its images do not fit the calibration.
         """
-        cameras = {COLOUR_TOPIC: self._calibration.colour, DEPTH_TOPIC: self._calibration.depth}
-        for topic, camera in cameras.items():
-            calibration = _calibration(camera or self._calibration.colour, frame.t_ns)
-            self._write(f"{topic}/calibration", calibration, frame.t_ns)
+        self._describe(frame.t_ns)
         self._write(f"{COLOUR_TOPIC}/image", self._colour(frame), frame.t_ns)
         self._write(f"{DEPTH_TOPIC}/image", self._depth(frame), frame.t_ns)
         shown = T_world_camera if T_world_camera is not None else frame.T_world_camera
         if shown is not None:
-            self._write("/tf", _transform(shown, frame.t_ns), frame.t_ns)
+            self._write("/tf", _transform((_MAP, _CAMERA), shown, frame.t_ns), frame.t_ns)
         if frame.T_world_camera is not None:
             self._write(TRUTH_TOPIC, _pose(frame.T_world_camera, frame.t_ns), frame.t_ns)
+
+    def _describe(self, t_ns: int) -> None:
+        """Both cameras; where depth has a place of its own, that too."""
+        device = self._calibration
+        colour = _calibration(device.colour, _CAMERA, t_ns)
+        depth = _calibration(device.depth_camera(), self._depth_frame, t_ns)
+        self._write(f"{COLOUR_TOPIC}/calibration", colour, t_ns)
+        self._write(f"{DEPTH_TOPIC}/calibration", depth, t_ns)
+        if self._depth_frame != _CAMERA:
+            frames = _CAMERA, self._depth_frame
+            self._write("/tf_static", _transform(frames, device.T_colour_depth, t_ns), t_ns)
 
     def _write(self, topic: str, message: Any, t_ns: int) -> None:
         self._writer.write_message(topic, message, t_ns, t_ns)
@@ -98,7 +108,7 @@ class Recorder:
         height, width = units.shape
         return RawImage(
             timestamp=_stamp(frame.t_ns),
-            frame_id=_CAMERA,
+            frame_id=self._depth_frame,
             width=width,
             height=height,
             encoding="16UC1",
@@ -116,11 +126,9 @@ def record_sequence(
         estimated: `T_world_camera` by t_ns, of the frames that have one.
 
     Raises:
-        ConfigError: the packages are not installed, or depth has a place of its own.
+        ConfigError: the packages are not installed.
         SequenceError: a frame cannot be read.
     """
-    if not np.array_equal(sequence.calibration.T_colour_depth, np.eye(4)):
-        raise ConfigError("MCAP is written of depth that is registered to colour only")
     with Recorder(path, sequence.calibration) as recorder:
         for index in range(len(sequence)):
             frame = sequence.frame(index)
@@ -149,14 +157,14 @@ def _compressed(image: ColourImage, calibration: Calibration) -> ColourImage:
     return encode_jpeg(decode_colour(image, calibration.colour.intrinsics))
 
 
-def _calibration(camera: Camera, t_ns: int) -> Any:
+def _calibration(camera: Camera, frame_id: str, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
     size = camera.intrinsics
     K = size.matrix()
     return CameraCalibration(
         timestamp=_stamp(t_ns),
-        frame_id=_CAMERA,
+        frame_id=frame_id,
         width=size.width,
         height=size.height,
         distortion_model="kannala_brandt" if camera.fisheye else "plumb_bob",
@@ -167,7 +175,7 @@ def _calibration(camera: Camera, t_ns: int) -> Any:
     )
 
 
-def _transform(T: Matrix, t_ns: int) -> Any:
+def _transform(frames: tuple[str, str], T: Matrix, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
     from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
@@ -175,8 +183,8 @@ def _transform(T: Matrix, t_ns: int) -> Any:
     pose = Pose.from_matrix(T)
     return FrameTransform(
         timestamp=_stamp(t_ns),
-        parent_frame_id=_MAP,
-        child_frame_id=_CAMERA,
+        parent_frame_id=frames[0],
+        child_frame_id=frames[1],
         translation=Vector3(**vars(pose.position)),
         rotation=Quaternion(**vars(pose.orientation)),
     )

@@ -13,9 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pointslam.datasets import mcap_messages as messages
 from pointslam.datasets.base import FileSequence, FrameFiles, SequenceOptions
 from pointslam.datasets.lists import associate, nearest
+from pointslam.datasets.mcap_transforms import SCHEMAS, FrameTree
 from shared.camera import Calibration, Camera
 from shared.errors import ConfigError, InputError, SequenceError
 from shared.frames import ColourImage, DepthImage
@@ -128,19 +131,32 @@ class Recording:
         """The device, by the frames that its images are in.
 
         Raises:
-            SequenceError: a camera is not described, or depth is of a frame of its own.
+            SequenceError: a camera is not described, or nothing joins depth's frame to colour's.
         """
         images = self._first_image(colour), self._first_image(depth)
-        if images[0].frame_id != images[1].frame_id:
+        T_colour_depth = self._tree().between(images[0].frame_id, images[1].frame_id)
+        if T_colour_depth is None:
             frames = f"depth is in frame {images[1].frame_id!r}, colour in {images[0].frame_id!r}"
-            raise SequenceError(self.path, f"{frames}: record depth aligned to colour")
+            advice = "record depth aligned to colour, or the transforms"
+            raise SequenceError(self.path, f"{frames}, and nothing joins them: {advice}")
         camera = self._camera(colour, images[0].frame_id)
         kept = json.loads(self._metadata.get("calibration", "{}"))
         is_float = images[1].encoding == "32FC1"
         usual = messages.FLOAT_DEPTH_SCALE if is_float else kept.get("depth_scale", _MILLIMETRES)
         calibration = Calibration(camera, float(depth_scale or usual))
         own = self._camera(depth, images[1].frame_id)
-        return calibration if own == camera else replace(calibration, depth=own)
+        if own == camera and np.array_equal(T_colour_depth, np.eye(4)):
+            return calibration
+        return replace(calibration, depth=own, T_colour_depth=T_colour_depth)
+
+    def _tree(self) -> FrameTree:
+        topics = self._of(SCHEMAS)
+        decoders = {topic: (self._schema(topic), self._decoder(topic)) for topic in topics}
+        return FrameTree(
+            (schema, decode(data))
+            for topic, (schema, decode) in decoders.items()
+            for data in self._data(topic)
+        )
 
     def _camera(self, topic: str, frame_id: str) -> Camera:
         """The calibration whose topic is most alike, of those of the frame."""

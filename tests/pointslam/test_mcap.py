@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from mcap.reader import make_reader
 from mcap_ros2.writer import Writer as RosWriter
 
 from pointslam.datasets import FileSequence, SequenceOptions, open_sequence
-from pointslam.recording import record_sequence
+from pointslam.recording import Recorder, record_sequence
+from shared import se3
 from shared.errors import SequenceError
 from shared.images import decode_colour, decode_depth
 
@@ -84,6 +87,20 @@ def test_foxglove_finds_its_own_schemas_in_a_recording(recorded):
         "foxglove.PoseInFrame",
         "foxglove.RawImage",
     }
+
+
+def test_depth_with_a_place_of_its_own_keeps_it(room, tmp_path):
+    T_colour_depth = se3.exp([0.025, 0.001, 0.0, 0.0, 0.01, 0.0])
+    camera = replace(room.calibration.colour, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
+    apart = replace(room.calibration, depth=camera, T_colour_depth=T_colour_depth)
+    path = tmp_path / "apart.mcap"
+
+    with Recorder(path, apart) as recorder:
+        recorder.frame(room.frame(0))
+
+    found = open_sequence(path).calibration
+    assert found.depth == camera
+    np.testing.assert_allclose(found.T_colour_depth, T_colour_depth, atol=1e-12)
 
 
 def pixels(seed: int) -> np.ndarray:
@@ -164,7 +181,7 @@ def test_millimetres_and_metres_are_both_depth(ros_bag, encoding):
 
 
 def test_depth_of_a_frame_of_its_own_is_refused(ros_bag):
-    with pytest.raises(SequenceError, match="'ir', colour in 'optical': record depth aligned"):
+    with pytest.raises(SequenceError, match="'ir', colour in 'optical', and nothing joins them"):
         open_sequence(ros_bag(depth_frame="ir"))
 
 
