@@ -58,9 +58,18 @@ def images(reply: RenderReply) -> list[np.ndarray]:
 def test_renders_beside_the_work_are_those_of_the_map_between_its_steps(
     calibration, work, request_view
 ):
+    def work_and_refine(mapper: Mapper, after) -> None:
+        work(mapper, after)
+        for progress in (0.0, 0.25, 0.5, 0.75):
+            mapper.refine(progress)
+            mapper.state(mapper.anchors.rows.room())  # of a snapshot
+            after()
+
     alone = Mapper(calibration, CONFIG, 0, torch.device("cpu"))
     expected = {}
-    work(alone, lambda: expected.update({alone.moment: images(alone.render(request_view))}))
+    work_and_refine(
+        alone, lambda: expected.update({alone.moment: images(alone.render(request_view))})
+    )
     busy = Mapper(calibration, CONFIG, 0, torch.device("cpu"))
     is_done = threading.Event()
 
@@ -72,7 +81,7 @@ def test_renders_beside_the_work_are_those_of_the_map_between_its_steps(
 
     with ThreadPoolExecutor(3) as pool:
         watchers = [pool.submit(watch) for _ in range(3)]
-        work(busy, lambda: None)
+        work_and_refine(busy, lambda: None)
         is_done.set()
 
     seen = [pair for watcher in watchers for pair in watcher.result()]
