@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _residuals(view, X, measured, sigmas, camera, y, r):  # noqa: PLR0913 - compiled
     """Fill the camera point y [3] and the normalised residuals r [3]."""
     for i in range(3):
@@ -22,7 +22,7 @@ def _residuals(view, X, measured, sigmas, camera, y, r):  # noqa: PLR0913 - comp
     r[2] = (y[2] - measured[2]) / sigmas[1] if measured[2] > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def huber_cost(  # noqa: PLR0913 - compiled
     views, points, camera_index, point_index, measured, sigmas, camera, huber
 ):  # pragma: no cover - compiled
@@ -39,7 +39,7 @@ def huber_cost(  # noqa: PLR0913 - compiled
     return cost
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearise(  # noqa: C901, PLR0913 - compiled
     views, points, camera_index, point_index, measured, sigmas, camera, huber
 ):  # pragma: no cover - compiled
@@ -95,7 +95,7 @@ def linearise(  # noqa: C901, PLR0913 - compiled
     return Hcc, Hpp, Hcp, bc, bp
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
     Hcc, Hpp, Hcp, bc, bp, camera_index, starts, damping
 ):  # pragma: no cover - compiled
@@ -134,7 +134,7 @@ def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
     return S, b, inverses
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _invert(H, damping, out):  # pragma: no cover - compiled
     """Inverse of a damped symmetric 3x3 matrix."""
     a = H[0, 0] * (1.0 + damping) + 1e-9
@@ -151,7 +151,7 @@ def _invert(H, damping, out):  # pragma: no cover - compiled
     out[2, 2] = (a * d - b * b) * inverse_det
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def back_substitute(inverses, Hcp, bp, camera_index, starts, twists):  # noqa: PLR0913 - compiled
     """Moves of the landmarks that belong to the cameras' twists."""
     moves = np.zeros((len(inverses), 3))

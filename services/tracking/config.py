@@ -146,6 +146,8 @@ class LoopVerificationConfig:
     """When a keyframe is believed to show the place of an earlier one."""
 
     max_candidates: int = 2
+    compared_features: int = 250  # the best, before all of them are matched without a pose
+    min_alike: int = 12  # of these; up to 11 were measured where another place is seen
     min_inliers: int = 40
     min_inlier_share: float = 0.4
     min_agreement: float = 0.85
@@ -156,7 +158,8 @@ class LoopVerificationConfig:
     unmoved_deg: float = 0.6
 
     def __post_init__(self) -> None:
-        _require_positive(self, "max_candidates", "min_inliers", "unmoved_m", "unmoved_deg")
+        _require_positive(self, "max_candidates", "compared_features", "min_inliers")
+        _require_positive(self, "unmoved_m", "unmoved_deg")
 
 
 @dataclass(frozen=True)

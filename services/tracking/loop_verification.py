@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from services.tracking.config import LoopVerificationConfig
 from services.tracking.estimate import Estimate
 from services.tracking.local_map import LocalMap
+from services.tracking.matching import match_by_descriptor
 from services.tracking.search import Job
 from services.tracking.verification import Step, step_between
 from shared.se3 import inverse
@@ -39,11 +40,19 @@ def _measure(job: Job, estimate: Estimate, local: LocalMap) -> Estimate | None:
     here = job.attempt(local, estimate.T_world_camera)
     if is_confirmed(here, config) or is_unmoved(here, estimate, config):
         return here
-    T_located = job.locate(local)
+    T_located = job.locate(local) if _looks_alike(job, local) else None
     if T_located is None:
         return None
     there = job.attempt(local, T_located)
     return there if is_confirmed(there, config) else None
+
+
+def _looks_alike(job: Job, local: LocalMap) -> bool:
+    """Whether enough of the best features are landmarks there, so that a search may succeed."""
+    config = job.config.loop
+    best = job.observed.features.first(config.compared_features)
+    matches = match_by_descriptor(best, local.context.landmarks, job.config.orb)
+    return len(matches) >= config.min_alike
 
 
 def is_confirmed(there: Estimate, config: LoopVerificationConfig) -> bool:

@@ -36,6 +36,15 @@ class Features:
         """Keypoints lifted by their depth, [M, 3]; zero where there is none."""
         return backproject(self.keypoints_px, self.depths_m, intrinsics)
 
+    def first(self, count: int) -> Features:
+        """The best ones."""
+        return Features(
+            self.keypoints_px[:count],
+            self.octaves[:count],
+            self.descriptors[:count],
+            self.depths_m[:count],
+        )
+
 
 def backproject(
     keypoints_px: NDArray[np.float32], depths_m: NDArray[np.float32], intrinsics: Intrinsics
