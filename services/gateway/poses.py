@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +10,11 @@ from numpy.typing import NDArray
 
 from shared import se3
 from shared.errors import NotFoundError
+from shared.frame_rows import ROW, STATUSES, read_row, write_row
 from shared.frames import HAS_POSE, TrackingStatus
 from shared.tracks import FrameRecord, KeyframePoses, TrackResult
+
+_HAS_POSE = np.array([status in HAS_POSE for status in STATUSES])
 
 
 def record_of(result: TrackResult) -> FrameRecord:
@@ -59,12 +60,17 @@ class PoseRing:
     """The last `size` answered frames of a session, by time."""
 
     def __init__(self, size: int, max_gap_s: float) -> None:
-        self._entries: deque[tuple[FrameRecord, int]] = deque(maxlen=size)
+        self._rows = np.empty(size, ROW)
+        self._revisions = np.empty(size, np.int64)  # of the map that each was answered in
+        self._count = 0  # ever added
         self._max_gap_ns = int(max_gap_s * 1e9)
 
     def add(self, record: FrameRecord, map_revision: int) -> None:
         """Add the newest answer and the revision of the map it was made against."""
-        self._entries.append((record, map_revision))
+        at = self._count % len(self._rows)
+        write_row(self._rows, at, record)
+        self._revisions[at] = map_revision
+        self._count += 1
 
     def clear(self) -> None:
         """Forget all."""
@@ -76,9 +82,9 @@ class PoseRing:
         Raises:
             NotFoundError: no frame has been answered.
         """
-        if not self._entries:
+        if self._count == 0:
             raise NotFoundError("no frame of this session has a pose yet")
-        return _corrected(*self._entries[-1], keyframes)
+        return self._pose((self._count - 1) % len(self._rows), keyframes)
 
     def at(self, t_ns: int, keyframes: KeyframePoses) -> TimedPose:
         """The pose at a time, between the two frames around it.
@@ -86,23 +92,33 @@ class PoseRing:
         Raises:
             NotFoundError: the time is outside what is kept, or there the camera was lost.
         """
-        entries = [entry for entry in self._entries if entry[0].status in HAS_POSE]
-        after = bisect.bisect_left(entries, t_ns, key=lambda entry: entry[0].t_ns)
-        if after < len(entries) and entries[after][0].t_ns == t_ns:
-            return _corrected(*entries[after], keyframes)
-        if not 0 < after < len(entries):
-            raise NotFoundError(f"no pose at {t_ns}: {_span(entries)}")
-        a = _corrected(*entries[after - 1], keyframes)
-        b = _corrected(*entries[after], keyframes)
+        places = self._places_with_pose()
+        times_ns = self._rows["t_ns"][places]
+        after = int(np.searchsorted(times_ns, t_ns))
+        if after < len(places) and times_ns[after] == t_ns:
+            return self._pose(places[after], keyframes)
+        if not 0 < after < len(places):
+            raise NotFoundError(f"no pose at {t_ns}: {_span(times_ns)}")
+        a, b = (self._pose(place, keyframes) for place in places[after - 1 : after + 1])
         if b.t_ns - a.t_ns > self._max_gap_ns:
             raise NotFoundError(f"no pose at {t_ns}: none from {a.t_ns} to {b.t_ns}")
         return _between(a, b, t_ns)
 
+    def _places_with_pose(self) -> NDArray[np.int64]:
+        """Rows of frames that have a pose, by time."""
+        size = len(self._rows)
+        places = np.arange(max(0, self._count - size), self._count) % size
+        return places[_HAS_POSE[self._rows["status"][places]]]
 
-def _span(entries: list[tuple[FrameRecord, int]]) -> str:
-    if not entries:
+    def _pose(self, place: int, keyframes: KeyframePoses) -> TimedPose:
+        record, revision = read_row(self._rows[place]), int(self._revisions[place])
+        return _corrected(record, revision, keyframes)
+
+
+def _span(times_ns: NDArray[np.int64]) -> str:
+    if len(times_ns) == 0:
         return "no frame of this session has a pose"
-    return f"poses are kept from {entries[0][0].t_ns} to {entries[-1][0].t_ns}"
+    return f"poses are kept from {times_ns[0]} to {times_ns[-1]}"
 
 
 def _corrected(record: FrameRecord, revision: int, keyframes: KeyframePoses) -> TimedPose:

@@ -101,3 +101,13 @@ def test_deviations_are_those_of_position_and_rotation():
 
 def test_an_unknown_covariance_has_no_deviation():
     assert deviations(np.full((6, 6), np.inf)) is None
+
+
+def test_the_oldest_frames_leave_when_the_ring_is_full(ring):
+    for seq in range(5, 25):
+        ring.add(record(seq, [0.1 * seq, 0, 0, 0, 0, 0]), map_revision=3)
+
+    assert ring.at(15 * SECOND, NO_CORRECTION).seq == 15
+    assert ring.last(NO_CORRECTION).seq == 24
+    with pytest.raises(NotFoundError, match="kept from 15000000000 to 24000000000"):
+        ring.at(14 * SECOND, NO_CORRECTION)
