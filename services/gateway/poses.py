@@ -74,7 +74,7 @@ class PoseRing:
 
     def clear(self) -> None:
         """Forget all."""
-        self._entries.clear()
+        self._count = 0
 
     def last(self, keyframes: KeyframePoses) -> TimedPose:
         """The newest answered frame; a LOST one has the last known pose.
