@@ -48,6 +48,7 @@ class RegistrationConfig:
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
     effective_share: float = 0.1  # residuals of neighbours are not independent
     model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas
+    turn_deg: float = 10.0  # of further starts, where none before led to a pose
 
     def __post_init__(self) -> None:
         levels = (self.voxel_sizes_m, self.sample_steps, self.max_iterations, self.tolerances)

@@ -32,6 +32,17 @@ def predict(prior: Prior, frame: Frame) -> NDArray[np.float64]:
     return prior.T_world_camera @ _constant_velocity(prior, frame)
 
 
+def turned_starts(
+    T_world_camera: NDArray[np.float64], turn_deg: float
+) -> list[NDArray[np.float64]]:
+    """A predicted pose turned both ways about each axis of the camera, six [4, 4].
+
+    A hand turns faster than it walks: from far off in angle a registration slides along a wall.
+    """
+    twists = np.radians(turn_deg) * np.concatenate([np.eye(3), -np.eye(3)])
+    return [T_world_camera @ exp(np.concatenate([np.zeros(3), twist])) for twist in twists]
+
+
 def _constant_velocity(prior: Prior, frame: Frame) -> NDArray[np.float64]:
     """T_last_now, if the last motion goes on; nothing where it is too old to go by."""
     if prior.before_last_dt_ns <= 0 or prior.lost_frames > 0:

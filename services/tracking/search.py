@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig, VerificationConfig
-from services.tracking.estimate import Estimate, attempt
+from services.tracking.estimate import Estimate, attempt, pose_covariance
+from services.tracking.keyframes import is_well_known
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.observed import Observed
-from services.tracking.prediction import predict
+from services.tracking.prediction import predict, turned_starts
 from services.tracking.relocalization import Recovery, is_found, locate, recover
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Step, is_possible_step, step_between
@@ -53,17 +54,34 @@ class Found:
 
 
 def search(job: Job, local: LocalMap) -> Found:
-    """Find the pose: nearby, then among the keyframes that look alike."""
-    estimate = _search_nearby(job, local)
-    if estimate is not None:
-        status = _status(job, estimate)
-        if status is not TrackingStatus.LOST:
-            return Found(status, estimate)
-    return _relocalise(job)
+    """Find the pose: nearby, then among the keyframes that look alike.
+
+    Where geometry alone leaves the pose open, a place that is known beyond doubt goes first.
+    """
+    nearby = _search_nearby(job, local)
+    if nearby.status is TrackingStatus.TRACKED or _is_held(nearby, job.config):
+        return nearby
+    elsewhere = _relocalise(job)
+    return elsewhere if elsewhere.estimate is not None else nearby
 
 
-def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
-    """The best of the attempts around the prior; the first that is beyond doubt ends the search."""
+def _is_held(found: Found, config: TrackingConfig) -> bool:
+    """Whether a pose is known well enough to go on from."""
+    if found.estimate is None:
+        return False
+    covariance = pose_covariance(found.estimate.information, config)
+    return is_well_known(covariance, config.keyframe)
+
+
+def _search_nearby(job: Job, local: LocalMap) -> Found:
+    """The best of the attempts around the prior, if it is believed."""
+    best = _best_nearby(job, local)
+    status = TrackingStatus.LOST if best is None else _status(job, best)
+    return Found(status, None if status is TrackingStatus.LOST else best)
+
+
+def _best_nearby(job: Job, local: LocalMap) -> Estimate | None:
+    """The first attempt that is beyond doubt ends the search; None without a prior."""
     prior = job.request.prior
     if prior is None:
         return None
@@ -75,8 +93,15 @@ def _search_nearby(job: Job, local: LocalMap) -> Estimate | None:
     if is_only_seen(first, config):
         return first
     starts = [job.locate(local), prior.T_world_camera.copy()]
-    others = [job.attempt(local, T) for T in starts if T is not None]
-    return max([first, *others], key=lambda estimate: estimate.score)
+    best = _best([first, *(job.attempt(local, T) for T in starts if T is not None)])
+    if is_confirmed(best, config) or best.agreement.is_silent or prior.lost_frames > 0:
+        return best
+    turned = turned_starts(predicted, job.config.registration.turn_deg)
+    return _best([best, *(job.attempt(local, T) for T in turned)])
+
+
+def _best(estimates: list[Estimate]) -> Estimate:
+    return max(estimates, key=lambda estimate: estimate.score)
 
 
 def _status(job: Job, estimate: Estimate) -> TrackingStatus:

@@ -21,13 +21,13 @@ from services.tracking.keyframes import (
     thumbnail_of,
 )
 from services.tracking.point_cloud import surface_from_depth
-from services.tracking.prediction import predict
+from services.tracking.prediction import predict, turned_starts
 from services.tracking.twists import exp_twist, inverse_rigid, log_twist
 from services.tracking.verification import depth_agreement, is_possible_step
 from shared.config import override
 from shared.errors import ConfigError
 from shared.frames import Prior
-from shared.se3 import Pose, exp, inverse, log
+from shared.se3 import Pose, angle_rad, exp, inverse, log
 from shared.tracks import PointCloud
 
 STEP = exp([0.02, 0.0, 0.01, 0.0, 0.02, 0.0])
@@ -75,6 +75,17 @@ def test_the_cameras_own_odometry_goes_before_constant_velocity(room):
     expected = predict(before, frame_at(room, 800, T_odom_camera=Pose.from_matrix(odom @ moved)))
 
     np.testing.assert_allclose(expected, before.T_world_camera @ moved, atol=1e-9)
+
+
+def test_turned_starts_stand_where_the_prediction_does_and_look_six_other_ways():
+    predicted = exp([1.0, 0.5, -0.2, 0.3, 0.1, 0.2])
+
+    starts = turned_starts(predicted, 10.0)
+
+    turns = [inverse(predicted) @ start for start in starts]
+    np.testing.assert_allclose([turn[:3, 3] for turn in turns], 0.0, atol=1e-12)
+    np.testing.assert_allclose([np.degrees(angle_rad(turn)) for turn in turns], 10.0)
+    assert len({tuple(np.round(log(turn), 6)) for turn in turns}) == 6
 
 
 def test_a_well_covered_frame_is_no_keyframe(room):
