@@ -262,6 +262,7 @@ class StandInMapper:
             refinement_s=0.0,
             map_bytes=0,
             device="cpu",
+            loops=1,
         )
 
 

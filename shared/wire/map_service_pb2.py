@@ -25,31 +25,31 @@ _sym_db = _symbol_database.Default()
 from shared.wire import types_pb2 as pointslam_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1epointslam/v1/map_service.proto\x12\x0cpointslam.v1\x1a\x18pointslam/v1/types.proto\"\'\n\x11GetMapInfoRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"\xb1\x02\n\x12GetMapInfoResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0e\n\x06mapper\x18\x02 \x01(\t\x12\r\n\x05\x65poch\x18\x03 \x01(\x03\x12\x14\n\x0cmap_revision\x18\x04 \x01(\x03\x12\x0e\n\x06\x66rames\x18\x05 \x01(\x03\x12\x11\n\tkeyframes\x18\x06 \x01(\x03\x12\x11\n\tlandmarks\x18\x07 \x01(\x03\x12\x17\n\x0fprimary_anchors\x18\x08 \x01(\x03\x12\x19\n\x11secondary_anchors\x18\t \x01(\x03\x12\x12\n\niterations\x18\n \x01(\x03\x12\x0f\n\x07pending\x18\x0b \x01(\x03\x12\x14\n\x07psnr_db\x18\x0c \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tmap_bytes\x18\r \x01(\x03\x12\x0e\n\x06\x64\x65vice\x18\x0e \x01(\tB\n\n\x08_psnr_db\"\x9c\x02\n\x11RenderViewRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12(\n\x0cT_map_camera\x18\x02 \x01(\x0b\x32\x12.pointslam.v1.Pose\x12\x31\n\nintrinsics\x18\x03 \x01(\x0b\x32\x18.pointslam.v1.IntrinsicsH\x00\x88\x01\x01\x12\x1c\n\x0f\x61ppearance_t_ns\x18\x04 \x01(\x03H\x01\x88\x01\x01\x12*\n\x07\x63ontent\x18\x05 \x01(\x0e\x32\x19.pointslam.v1.ViewContent\x12)\n\x06\x66ormat\x18\x06 \x01(\x0e\x32\x19.pointslam.v1.ImageFormatB\r\n\x0b_intrinsicsB\x12\n\x10_appearance_t_ns\"\x87\x01\n\x12RenderViewResponse\x12\x14\n\x0cmap_revision\x18\x01 \x01(\x03\x12)\n\x06\x66ormat\x18\x02 \x01(\x0e\x32\x19.pointslam.v1.ImageFormat\x12\r\n\x05image\x18\x03 \x01(\x0c\x12\x12\n\nconfidence\x18\x04 \x01(\x01\x12\r\n\x05state\x18\x05 \x01(\t\"O\n\x10\x45xportMapRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\'\n\x06\x66ormat\x18\x02 \x01(\x0e\x32\x17.pointslam.v1.MapFormat\"A\n\x11\x45xportMapResponse\x12\x0e\n\x06offset\x18\x01 \x01(\x03\x12\r\n\x05total\x18\x02 \x01(\x03\x12\r\n\x05\x62ytes\x18\x03 \x01(\x0c*\x91\x01\n\x0bViewContent\x12\x1c\n\x18VIEW_CONTENT_UNSPECIFIED\x10\x00\x12\x17\n\x13VIEW_CONTENT_COLOUR\x10\x01\x12\x16\n\x12VIEW_CONTENT_DEPTH\x10\x02\x12\x16\n\x12VIEW_CONTENT_ALPHA\x10\x03\x12\x1b\n\x17VIEW_CONTENT_CONFIDENCE\x10\x04*X\n\x0bImageFormat\x12\x1c\n\x18IMAGE_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11IMAGE_FORMAT_JPEG\x10\x01\x12\x14\n\x10IMAGE_FORMAT_PNG\x10\x02*\xc1\x01\n\tMapFormat\x12\x1a\n\x16MAP_FORMAT_UNSPECIFIED\x10\x00\x12\x12\n\x0eMAP_FORMAT_PLY\x10\x01\x12\x13\n\x0fMAP_FORMAT_MESH\x10\x02\x12\x17\n\x13MAP_FORMAT_SNAPSHOT\x10\x03\x12\x12\n\x0eMAP_FORMAT_SPZ\x10\x04\x12\x12\n\x0eMAP_FORMAT_GLB\x10\x05\x12\x17\n\x13MAP_FORMAT_MESH_GLB\x10\x06\x12\x15\n\x11MAP_FORMAT_POINTS\x10\x07\x32\xfe\x01\n\nMapService\x12O\n\nGetMapInfo\x12\x1f.pointslam.v1.GetMapInfoRequest\x1a .pointslam.v1.GetMapInfoResponse\x12O\n\nRenderView\x12\x1f.pointslam.v1.RenderViewRequest\x1a .pointslam.v1.RenderViewResponse\x12N\n\tExportMap\x12\x1e.pointslam.v1.ExportMapRequest\x1a\x1f.pointslam.v1.ExportMapResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1epointslam/v1/map_service.proto\x12\x0cpointslam.v1\x1a\x18pointslam/v1/types.proto\"\'\n\x11GetMapInfoRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"\xc0\x02\n\x12GetMapInfoResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0e\n\x06mapper\x18\x02 \x01(\t\x12\r\n\x05\x65poch\x18\x03 \x01(\x03\x12\x14\n\x0cmap_revision\x18\x04 \x01(\x03\x12\x0e\n\x06\x66rames\x18\x05 \x01(\x03\x12\x11\n\tkeyframes\x18\x06 \x01(\x03\x12\x11\n\tlandmarks\x18\x07 \x01(\x03\x12\x17\n\x0fprimary_anchors\x18\x08 \x01(\x03\x12\x19\n\x11secondary_anchors\x18\t \x01(\x03\x12\x12\n\niterations\x18\n \x01(\x03\x12\x0f\n\x07pending\x18\x0b \x01(\x03\x12\x14\n\x07psnr_db\x18\x0c \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tmap_bytes\x18\r \x01(\x03\x12\x0e\n\x06\x64\x65vice\x18\x0e \x01(\t\x12\r\n\x05loops\x18\x0f \x01(\x03\x42\n\n\x08_psnr_db\"\x9c\x02\n\x11RenderViewRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12(\n\x0cT_map_camera\x18\x02 \x01(\x0b\x32\x12.pointslam.v1.Pose\x12\x31\n\nintrinsics\x18\x03 \x01(\x0b\x32\x18.pointslam.v1.IntrinsicsH\x00\x88\x01\x01\x12\x1c\n\x0f\x61ppearance_t_ns\x18\x04 \x01(\x03H\x01\x88\x01\x01\x12*\n\x07\x63ontent\x18\x05 \x01(\x0e\x32\x19.pointslam.v1.ViewContent\x12)\n\x06\x66ormat\x18\x06 \x01(\x0e\x32\x19.pointslam.v1.ImageFormatB\r\n\x0b_intrinsicsB\x12\n\x10_appearance_t_ns\"\x87\x01\n\x12RenderViewResponse\x12\x14\n\x0cmap_revision\x18\x01 \x01(\x03\x12)\n\x06\x66ormat\x18\x02 \x01(\x0e\x32\x19.pointslam.v1.ImageFormat\x12\r\n\x05image\x18\x03 \x01(\x0c\x12\x12\n\nconfidence\x18\x04 \x01(\x01\x12\r\n\x05state\x18\x05 \x01(\t\"O\n\x10\x45xportMapRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\'\n\x06\x66ormat\x18\x02 \x01(\x0e\x32\x17.pointslam.v1.MapFormat\"A\n\x11\x45xportMapResponse\x12\x0e\n\x06offset\x18\x01 \x01(\x03\x12\r\n\x05total\x18\x02 \x01(\x03\x12\r\n\x05\x62ytes\x18\x03 \x01(\x0c*\x91\x01\n\x0bViewContent\x12\x1c\n\x18VIEW_CONTENT_UNSPECIFIED\x10\x00\x12\x17\n\x13VIEW_CONTENT_COLOUR\x10\x01\x12\x16\n\x12VIEW_CONTENT_DEPTH\x10\x02\x12\x16\n\x12VIEW_CONTENT_ALPHA\x10\x03\x12\x1b\n\x17VIEW_CONTENT_CONFIDENCE\x10\x04*X\n\x0bImageFormat\x12\x1c\n\x18IMAGE_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11IMAGE_FORMAT_JPEG\x10\x01\x12\x14\n\x10IMAGE_FORMAT_PNG\x10\x02*\xc1\x01\n\tMapFormat\x12\x1a\n\x16MAP_FORMAT_UNSPECIFIED\x10\x00\x12\x12\n\x0eMAP_FORMAT_PLY\x10\x01\x12\x13\n\x0fMAP_FORMAT_MESH\x10\x02\x12\x17\n\x13MAP_FORMAT_SNAPSHOT\x10\x03\x12\x12\n\x0eMAP_FORMAT_SPZ\x10\x04\x12\x12\n\x0eMAP_FORMAT_GLB\x10\x05\x12\x17\n\x13MAP_FORMAT_MESH_GLB\x10\x06\x12\x15\n\x11MAP_FORMAT_POINTS\x10\x07\x32\xfe\x01\n\nMapService\x12O\n\nGetMapInfo\x12\x1f.pointslam.v1.GetMapInfoRequest\x1a .pointslam.v1.GetMapInfoResponse\x12O\n\nRenderView\x12\x1f.pointslam.v1.RenderViewRequest\x1a .pointslam.v1.RenderViewResponse\x12N\n\tExportMap\x12\x1e.pointslam.v1.ExportMapRequest\x1a\x1f.pointslam.v1.ExportMapResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'pointslam.v1.map_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_VIEWCONTENT']._serialized_start=997
-  _globals['_VIEWCONTENT']._serialized_end=1142
-  _globals['_IMAGEFORMAT']._serialized_start=1144
-  _globals['_IMAGEFORMAT']._serialized_end=1232
-  _globals['_MAPFORMAT']._serialized_start=1235
-  _globals['_MAPFORMAT']._serialized_end=1428
+  _globals['_VIEWCONTENT']._serialized_start=1012
+  _globals['_VIEWCONTENT']._serialized_end=1157
+  _globals['_IMAGEFORMAT']._serialized_start=1159
+  _globals['_IMAGEFORMAT']._serialized_end=1247
+  _globals['_MAPFORMAT']._serialized_start=1250
+  _globals['_MAPFORMAT']._serialized_end=1443
   _globals['_GETMAPINFOREQUEST']._serialized_start=74
   _globals['_GETMAPINFOREQUEST']._serialized_end=113
   _globals['_GETMAPINFORESPONSE']._serialized_start=116
-  _globals['_GETMAPINFORESPONSE']._serialized_end=421
-  _globals['_RENDERVIEWREQUEST']._serialized_start=424
-  _globals['_RENDERVIEWREQUEST']._serialized_end=708
-  _globals['_RENDERVIEWRESPONSE']._serialized_start=711
-  _globals['_RENDERVIEWRESPONSE']._serialized_end=846
-  _globals['_EXPORTMAPREQUEST']._serialized_start=848
-  _globals['_EXPORTMAPREQUEST']._serialized_end=927
-  _globals['_EXPORTMAPRESPONSE']._serialized_start=929
-  _globals['_EXPORTMAPRESPONSE']._serialized_end=994
-  _globals['_MAPSERVICE']._serialized_start=1431
-  _globals['_MAPSERVICE']._serialized_end=1685
+  _globals['_GETMAPINFORESPONSE']._serialized_end=436
+  _globals['_RENDERVIEWREQUEST']._serialized_start=439
+  _globals['_RENDERVIEWREQUEST']._serialized_end=723
+  _globals['_RENDERVIEWRESPONSE']._serialized_start=726
+  _globals['_RENDERVIEWRESPONSE']._serialized_end=861
+  _globals['_EXPORTMAPREQUEST']._serialized_start=863
+  _globals['_EXPORTMAPREQUEST']._serialized_end=942
+  _globals['_EXPORTMAPRESPONSE']._serialized_start=944
+  _globals['_EXPORTMAPRESPONSE']._serialized_end=1009
+  _globals['_MAPSERVICE']._serialized_start=1446
+  _globals['_MAPSERVICE']._serialized_end=1700
 # @@protoc_insertion_point(module_scope)

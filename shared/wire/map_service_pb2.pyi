@@ -55,7 +55,7 @@ class GetMapInfoRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ...) -> None: ...
 
 class GetMapInfoResponse(_message.Message):
-    __slots__ = ("session_id", "mapper", "epoch", "map_revision", "frames", "keyframes", "landmarks", "primary_anchors", "secondary_anchors", "iterations", "pending", "psnr_db", "map_bytes", "device")
+    __slots__ = ("session_id", "mapper", "epoch", "map_revision", "frames", "keyframes", "landmarks", "primary_anchors", "secondary_anchors", "iterations", "pending", "psnr_db", "map_bytes", "device", "loops")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     MAPPER_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -70,6 +70,7 @@ class GetMapInfoResponse(_message.Message):
     PSNR_DB_FIELD_NUMBER: _ClassVar[int]
     MAP_BYTES_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
+    LOOPS_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     mapper: str
     epoch: int
@@ -84,7 +85,8 @@ class GetMapInfoResponse(_message.Message):
     psnr_db: float
     map_bytes: int
     device: str
-    def __init__(self, session_id: _Optional[str] = ..., mapper: _Optional[str] = ..., epoch: _Optional[int] = ..., map_revision: _Optional[int] = ..., frames: _Optional[int] = ..., keyframes: _Optional[int] = ..., landmarks: _Optional[int] = ..., primary_anchors: _Optional[int] = ..., secondary_anchors: _Optional[int] = ..., iterations: _Optional[int] = ..., pending: _Optional[int] = ..., psnr_db: _Optional[float] = ..., map_bytes: _Optional[int] = ..., device: _Optional[str] = ...) -> None: ...
+    loops: int
+    def __init__(self, session_id: _Optional[str] = ..., mapper: _Optional[str] = ..., epoch: _Optional[int] = ..., map_revision: _Optional[int] = ..., frames: _Optional[int] = ..., keyframes: _Optional[int] = ..., landmarks: _Optional[int] = ..., primary_anchors: _Optional[int] = ..., secondary_anchors: _Optional[int] = ..., iterations: _Optional[int] = ..., pending: _Optional[int] = ..., psnr_db: _Optional[float] = ..., map_bytes: _Optional[int] = ..., device: _Optional[str] = ..., loops: _Optional[int] = ...) -> None: ...
 
 class RenderViewRequest(_message.Message):
     __slots__ = ("session_id", "T_map_camera", "intrinsics", "appearance_t_ns", "content", "format")

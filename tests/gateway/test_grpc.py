@@ -149,6 +149,7 @@ def test_the_map_tells_its_state(track, maps, name):
     info = maps.GetMapInfo(map_service_pb2.GetMapInfoRequest(session_id=name))
 
     assert (info.frames, info.keyframes, info.mapper) == (12, 2, "mapper-0")
+    assert info.loops == 1
     assert not info.HasField("psnr_db")
 
 
