@@ -24,7 +24,8 @@ class Keys:
     def mapper(mapper: str, question: str) -> str:
         """Queries to one mapper.
 
-        open (OpenRequest, OpenReply), list (Empty, SessionList), delete (DeleteRequest, Empty).
+        open (OpenRequest, OpenReply), list (Empty, SessionList), delete (DeleteRequest, Empty),
+        pin (PinRequest, Empty).
         """
         return f"{ROOT}/mapper/{mapper}/{question}"
 

@@ -189,6 +189,14 @@ class DeleteRequest:
 
 
 @dataclass(frozen=True)
+class PinRequest:
+    """Keep a session whatever the rule of retention says, or no longer."""
+
+    session: str
+    is_pinned: bool
+
+
+@dataclass(frozen=True)
 class SessionSummary:
     """A session on a mapper's disk."""
 
@@ -197,6 +205,7 @@ class SessionSummary:
     mode: str
     keyframes: int
     is_open: bool
+    is_pinned: bool = False  # no rule of retention deletes it
 
 
 @dataclass(frozen=True)

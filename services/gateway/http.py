@@ -58,6 +58,16 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
         """Remove the session and every byte of it."""
         await sessions.delete(name)
 
+    @router.put("/v1/sessions/{name}/pin", status_code=204)
+    async def pin_session(name: str) -> None:
+        """Keep the session for ever: no rule of retention deletes it."""
+        await sessions.pin(name, True)
+
+    @router.delete("/v1/sessions/{name}/pin", status_code=204)
+    async def unpin_session(name: str) -> None:
+        """Let the rule of retention have the session again."""
+        await sessions.pin(name, False)
+
     @router.post("/v1/sessions/{name}/frames", openapi_extra=examples.POST_FRAME)
     async def post_frame(name: str, request: Request) -> Response:
         """Track one frame: a msgpack FrameMessage in, a FrameReply out (JSON if accepted)."""

@@ -105,7 +105,7 @@ class Session:
         return self._frames.age_s
 
     def submit(self, message: FrameMessage) -> asyncio.Future[Outcome]:
-        """Queue a checked frame; raises as `FrameQueue.submit`, or ClaimLostError without one."""
+        """Queue a checked frame; raises as `FrameQueue.submit`, ClaimLostError where it is lost."""
         self._require_claim()
         self.usage.touch()
         return self._frames.submit(message)

@@ -27,7 +27,7 @@ from shared.errors import (
     PointSlamError,
     UnavailableError,
 )
-from shared.maps import DeleteRequest, Empty, MapInfo, SessionList
+from shared.maps import DeleteRequest, Empty, MapInfo, PinRequest, SessionList
 from shared.se3 import Pose
 from shared.tracks import OpenReply, OpenRequest
 
@@ -158,6 +158,20 @@ class Sessions:
         await self.fabric.bus.ask(key, DeleteRequest(name), Empty, timeout_s)
         if self._open.pop(name, None) is not None and session is not None:
             session.close()
+
+    async def pin(self, name: str, is_pinned: bool) -> None:
+        """Keep a session whatever the mapper's rule of retention says, or no longer.
+
+        Raises:
+            NotFoundError: there is no such session.
+        """
+        name = full_name(name)
+        mapper = await self._mapper_of(name)
+        if mapper is None:
+            raise NotFoundError(f"no session {public_name(name)!r}")
+        timeout_s = self.fabric.config.mapping.question_timeout_s
+        request = PinRequest(name, is_pinned)
+        await self.fabric.bus.ask(Keys.mapper(mapper, "pin"), request, Empty, timeout_s)
 
     async def info(self, session: Session) -> dict[str, Any]:
         """The map's state with the tracking side's under `tracking`, as plain JSON values."""

@@ -213,6 +213,23 @@ class OwnerConfig:
 
 
 @dataclass(frozen=True)
+class RetentionConfig:
+    """When sessions that are neither open nor pinned are deleted, oldest first; 0: never."""
+
+    max_days: float = 0.0  # since they were written to last
+    max_gb: float = 0.0  # of all sessions together, 1e9 bytes
+
+    def __post_init__(self) -> None:
+        _check(self.max_days >= 0, "retention.max_days must not be negative")
+        _check(self.max_gb >= 0, "retention.max_gb must not be negative")
+
+    @property
+    def is_set(self) -> bool:
+        """Whether anything is ever deleted."""
+        return self.max_days > 0 or self.max_gb > 0
+
+
+@dataclass(frozen=True)
 class MappingConfig:
     """All settings of the mapping service."""
 
@@ -226,5 +243,6 @@ class MappingConfig:
     render: RenderConfig = field(default_factory=RenderConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
     owner: OwnerConfig = field(default_factory=OwnerConfig)
+    retention: RetentionConfig = field(default_factory=RetentionConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)

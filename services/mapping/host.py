@@ -5,18 +5,19 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from services.mapping.config import MappingConfig
+from services.mapping.janitor import Janitor
 from services.mapping.leases import open_lease_store
 from services.mapping.log import count_keyframes
 from services.mapping.opening import check_same, new_record
+from services.mapping.retention import is_pinned, overdue, set_pinned, stored_session
+from services.mapping.served import Served, answers, withdraw
 from services.mapping.session import Session, Surroundings
 from services.mapping.storage import (
     SessionFolder,
@@ -37,20 +38,12 @@ from shared.errors import (
 from shared.maps import (
     DeleteRequest,
     Empty,
-    ExportRequest,
     MapInfo,
-    RefineRequest,
-    RenderRequest,
-    SaveRequest,
+    PinRequest,
     SessionList,
     SessionSummary,
-    TrajectoryRequest,
 )
 from shared.tracks import (
-    Advance,
-    CandidatesRequest,
-    ClaimRequest,
-    ContextRequest,
     OpenReply,
     OpenRequest,
 )
@@ -70,25 +63,6 @@ class MapperSettings:
     device: torch.device
 
 
-@dataclass
-class _Served:
-    """An open session and what must be undone to close it."""
-
-    session: Session
-    advances: ThreadPoolExecutor  # one thread: the entries of a session stay in order
-    stops: list[Callable[[], None]] = field(default_factory=list)
-    used_s: float = field(default_factory=time.monotonic)
-
-    def noting_use(self, answer: Callable[[Any], object]) -> Callable[[Any], object]:
-        """`answer`, noting that somebody asked."""
-
-        def noted(request: Any) -> object:
-            self.used_s = time.monotonic()
-            return answer(request)
-
-        return noted
-
-
 class MapperHost:
     """Opens, lists and deletes sessions, and serves those that are open."""
 
@@ -96,17 +70,17 @@ class MapperHost:
         self._bus = bus
         self._settings = settings
         self._lock = threading.Lock()
-        self._served: dict[str, _Served] = {}
+        self._served: dict[str, Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
         self._slow = {
             question: ThreadPoolExecutor(threads, thread_name_prefix=question)
             for question, threads in _SLOW_THREADS.items()
         }
-        self._is_closed = threading.Event()
         owner = settings.config.owner
         store = open_lease_store(owner.lease_store, settings.data)
         self._tenure = Tenure(store, settings.name, owner.lease_s, self._lost)
-        self._janitor = threading.Thread(target=self._put_away_idle, name="janitor", daemon=True)
+        tidying = (self._put_away_idle, self._delete_overdue)
+        self._janitor = Janitor(min(owner.session_idle_s / 4, 15.0), tidying)
         with storage_errors(str(settings.data)):
             settings.data.mkdir(parents=True, exist_ok=True)
 
@@ -117,6 +91,7 @@ class MapperHost:
             ("open", OpenRequest, self.open),
             ("list", Empty, lambda _: self.list()),
             ("delete", DeleteRequest, self.delete),
+            ("pin", PinRequest, self.pin),
         ):
             self._bus.serve(Keys.mapper(name, question), kind, answer, self._queries)
         self._bus.declare_alive("mapping", name)
@@ -160,22 +135,33 @@ class MapperHost:
             NotFoundError: there is no such session.
             ConflictError: another mapper owns it.
         """
-        check_session_name(request.session)
-        path = self._settings.data / request.session
+        path = self._folder_of(request.session)
         with self._lock:
-            if not has_session(path):
-                raise NotFoundError(f"there is no session {request.session}")
             if (served := self._served.pop(request.session, None)) is not None:
-                _withdraw(served, is_saved=False)
-            else:
-                self._tenure.claim(request.session, above=0)
-            remove_session(path)
-            self._tenure.forget(request.session)
+                withdraw(served, is_saved=False)
+            self._remove(path.name)
         return Empty()
+
+    def pin(self, request: PinRequest) -> Empty:
+        """Keep a session whatever the rule of retention says, or no longer.
+
+        Raises:
+            NotFoundError: there is no such session.
+            StorageError: the disk refused.
+        """
+        set_pinned(self._folder_of(request.session), request.is_pinned)
+        return Empty()
+
+    def _folder_of(self, session: str) -> Path:
+        check_session_name(session)
+        path = self._settings.data / session
+        if not has_session(path):
+            raise NotFoundError(f"there is no session {session}")
+        return path
 
     def close(self) -> None:
         """Withdraw every session, with a snapshot of each."""
-        self._is_closed.set()
+        self._janitor.stop()
         with self._lock:
             for name in list(self._served):
                 self._put_away(name)
@@ -186,17 +172,35 @@ class MapperHost:
     def _put_away_idle(self) -> None:
         """Keep memory bounded: what nobody asks for goes to disk; opening it takes it up again."""
         idle_s = self._settings.config.owner.session_idle_s
-        while not self._is_closed.wait(min(idle_s / 4, 15.0)):
+        with self._lock:
+            for name, served in list(self._served.items()):
+                is_idle = time.monotonic() - served.used_s > idle_s
+                if is_idle and not served.session.is_working:
+                    self._put_away(name)
+                    LOGGER.info("%s: idle, put away", name)
+
+    def _delete_overdue(self) -> None:
+        """Keep the disk bounded, if settings say so."""
+        rule, data = self._settings.config.retention, self._settings.data
+        if not rule.is_set:
+            return
+        folders = [path for path in data.iterdir() if has_session(path)]
+        stored = [stored_session(path, self._tenure.is_leased(path.name)) for path in folders]
+        for name in overdue(stored, rule, time.time()):
             with self._lock:
-                for name, served in list(self._served.items()):
-                    is_idle = time.monotonic() - served.used_s > idle_s
-                    if is_idle and not served.session.is_working:
-                        self._put_away(name)
-                        LOGGER.info("%s: idle, put away", name)
+                if name not in self._served:  # nobody opened it meanwhile
+                    self._remove(name)
+
+    def _remove(self, name: str) -> None:
+        """Remove every byte of a session that is not open; the caller holds the lock."""
+        self._tenure.claim(name, above=0)
+        remove_session(self._settings.data / name)
+        self._tenure.forget(name)
+        LOGGER.info("%s: deleted", name)
 
     def _put_away(self, name: str) -> None:
         """Save a session and let any mapper have it; the caller holds the lock."""
-        _withdraw(self._served.pop(name), is_saved=True)
+        withdraw(self._served.pop(name), is_saved=True)
         self._tenure.release(name)
 
     def _lost(self, name: str, epoch: int) -> None:
@@ -207,7 +211,7 @@ class MapperHost:
         with self._lock:
             served = self._served.get(name)
             if served is not None and served.session.record.epoch == epoch:
-                _withdraw(self._served.pop(name), is_saved=False)
+                withdraw(self._served.pop(name), is_saved=False)
 
     def _claim(self, request: OpenRequest) -> tuple[SessionFolder, Lease]:
         """The session's folder and lease; a new session's folder is made when it is ours."""
@@ -223,7 +227,7 @@ class MapperHost:
             folder.write_record(record)
         return folder, lease
 
-    def _serve(self, request: OpenRequest) -> _Served:
+    def _serve(self, request: OpenRequest) -> Served:
         settings = self._settings
         if len(self._served) >= settings.config.owner.max_sessions:
             raise UnavailableError(f"mapper {settings.name} has {len(self._served)} sessions open")
@@ -236,9 +240,9 @@ class MapperHost:
         except PointSlamError:
             self._tenure.release(request.session)
             raise
-        served = _Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
+        served = Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
         record = session.record
-        for question, kind, answer in _answers(session):
+        for question, kind, answer in answers(session):
             executor = self._slow.get(question, self._queries)
             executor = served.advances if question == "advance" else executor
             key = Keys.session(record.session, record.epoch, question)
@@ -268,31 +272,5 @@ class MapperHost:
             mode=record.mode,
             keyframes=served.session.ledger.num_keyframes if served else keyframes,
             is_open=served is not None,
+            is_pinned=is_pinned(folder),
         )
-
-
-def _answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]]:
-    """The questions of `Keys.session`, with what they carry and who answers."""
-    ledger = session.ledger
-    return [
-        ("claim", ClaimRequest, session.claim),
-        ("advance", Advance, session.advance),
-        ("context", ContextRequest, ledger.context),
-        ("candidates", CandidatesRequest, ledger.candidates),
-        ("keyframes", Empty, lambda _: ledger.poses()),
-        ("render", RenderRequest, session.render),
-        ("export", ExportRequest, session.export),
-        ("refine", RefineRequest, session.refine),
-        ("refinement", Empty, lambda _: session.refinement),
-        ("interrupt", Empty, lambda _: session.interrupt()),
-        ("save", SaveRequest, lambda _: session.save()),
-        ("info", Empty, lambda _: session.info()),
-        ("trajectory", TrajectoryRequest, lambda _: ledger.trajectory()),
-    ]
-
-
-def _withdraw(served: _Served, is_saved: bool) -> None:
-    for stop in served.stops:
-        stop()
-    served.advances.shutdown(wait=True, cancel_futures=True)  # none may find the log closed
-    served.session.close(is_saved)

@@ -89,6 +89,15 @@ class Tenure:
         is_fresh = held is not None and time.monotonic() - held.renewed_s < self._sure_s
         return held is not None and held.epoch == epoch and is_fresh
 
+    def is_leased(self, session: str) -> bool:
+        """Whether the lease of a session is running, ours or another mapper's.
+
+        Raises:
+            StorageError: the store cannot be reached.
+        """
+        holder = self._store.holder(session)
+        return holder is not None and holder.left_s > 0
+
     def release(self, session: str) -> None:
         """Let another mapper have a session at once; a store out of reach lets it end by itself."""
         with self._lock:

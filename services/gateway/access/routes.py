@@ -43,6 +43,8 @@ HTTP: dict[str, Access] = {
     "POST /v1/sessions": INGEST,
     f"GET {_SESSION}": ANY,
     f"DELETE {_SESSION}": ADMIN,
+    f"PUT {_SESSION}/pin": ADMIN,
+    f"DELETE {_SESSION}/pin": ADMIN,
     f"POST {_SESSION}/frames": INGEST,
     f"WS {_SESSION}/stream": Access(INGEST.scopes, takes_ticket=True),
     f"POST {_SESSION}/localize": POSE,
