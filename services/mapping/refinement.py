@@ -26,15 +26,21 @@ class Refinement:
     """The present or the last refinement of a session; safe from any thread."""
 
     def __init__(
-        self, folder: Path, saved: JobStatus, check_owner: Callable[[], None] = lambda: None
+        self,
+        folder: Path,
+        saved: JobStatus,
+        check_owner: Callable[[], None] = lambda: None,
+        ended: Callable[[], None] = lambda: None,
     ) -> None:
         """Take up what a session's folder says.
 
         Args:
             saved: the refinement of the snapshot that the map is taken up from.
             check_owner: raises before the folder is written to if it is another owner's by now.
+            ended: called when one has ended.
         """
         self._check_owner = check_owner
+        self._ended = ended
         self._path = folder / _FILE
         self._lock = threading.Lock()
         self._status = _taken_up(self._path, saved)
@@ -85,6 +91,7 @@ class Refinement:
         except PointSlamError as failure:  # it has ended all the same
             LOGGER.error("the end of a refinement is not on disk: %s", failure)
             self._status = ended
+        self._ended()
 
     def _set(self, status: JobStatus) -> None:
         self._check_owner()

@@ -80,7 +80,9 @@ class Session:
         self._saved = 0, 0  # log entries and iterations of the newest snapshot
         mapper = Mapper(self.record.calibration, config, self.record.seed, surroundings.device)
         self._renders = Renders(mapper, self.record.epoch, config.render)
-        refinement = Refinement(folder.path, self.ledger.resumed.refinement, lease.check)
+        self._worth_saving = threading.Event()  # set by the end of a refinement, and of the session
+        resumed, ended = self.ledger.resumed.refinement, self._worth_saving.set
+        refinement = Refinement(folder.path, resumed, lease.check, ended)
         self._worker = MapWorker(mapper, refinement, self.record.mode, config)
         self._take_up(mapper)
         self._calm = threading.Lock()  # held while a snapshot wants no new entries
@@ -262,6 +264,7 @@ class Session:
     def close(self, is_saved: bool = True) -> None:
         """End the session's threads; with a snapshot unless nothing is new."""
         self._is_closed.set()
+        self._worth_saving.set()
         self._saver.join()
         if is_saved:
             self._save_if_near()
@@ -271,8 +274,11 @@ class Session:
 
     def _save_now_and_then(self) -> None:
         interval_s = self._surroundings.config.owner.snapshot_interval_s
-        while not self._is_closed.wait(interval_s):
-            self._save_if_near()
+        while not self._is_closed.is_set():
+            self._worth_saving.wait(interval_s)
+            self._worth_saving.clear()
+            if not self._is_closed.is_set():
+                self._save_if_near()
 
     def _is_saved(self) -> bool:
         return self._saved == (self.ledger.entries, self._worker.iterations)
