@@ -94,10 +94,20 @@ def _best_nearby(job: Job, local: LocalMap) -> Estimate | None:
         return first
     starts = [job.locate(local), prior.T_world_camera.copy()]
     best = _best([first, *(job.attempt(local, T) for T in starts if T is not None)])
-    if is_confirmed(best, config) or best.agreement.is_silent or prior.lost_frames > 0:
+    if prior.lost_frames > 0 or not _is_doubtful(best, predicted, config):
         return best
     turned = turned_starts(predicted, job.config.registration.turn_deg)
     return _best([best, *(job.attempt(local, T) for T in turned)])
+
+
+def _is_doubtful(
+    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
+) -> bool:
+    """Not confirmed, and not where it was expected either, though there is depth to find it by."""
+    near = Step(config.near_step_m, config.near_step_deg)
+    is_near = step_between(T_predicted, estimate.T_world_camera).is_within(near)
+    is_expected = is_near and is_coarse(estimate, T_predicted, config)
+    return not (is_confirmed(estimate, config) or is_expected or estimate.agreement.is_silent)
 
 
 def _best(estimates: list[Estimate]) -> Estimate:
