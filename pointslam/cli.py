@@ -123,6 +123,7 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--http-port", type=int, default=8080, metavar="P")
     parser.add_argument("--grpc-port", type=int, default=50051, metavar="P")
     parser.add_argument("--mappers", type=int, default=1, metavar="N", help="share the sessions")
+    parser.add_argument("--gateways", type=int, default=1, metavar="N", help="at ports P, P+1, ...")
     parser.add_argument("--traces", default="", metavar="TARGET", help="http://otlp or file:FOLDER")
     parser.add_argument("--host", default="127.0.0.1", help="other than loopback needs --keys")
     parser.add_argument("--keys", type=Path, metavar="FILE", help="only with a key of this store")
@@ -142,6 +143,7 @@ def _up(arguments: argparse.Namespace) -> None:
         logs=arguments.data / "logs",
         num_trackers=arguments.trackers,
         num_mappers=arguments.mappers,
+        num_gateways=arguments.gateways,
         traces=arguments.traces,
         device=arguments.device,
         http_port=arguments.http_port,

@@ -57,12 +57,18 @@ class LaunchOptions:
     http_port: int = 0
     grpc_port: int = 0
     num_mappers: int = 1
+    num_gateways: int = 1  # the first has the ports given, the others those that follow
     traces: str = ""  # where spans go, as the services' --traces
     access: Access = field(default_factory=Access)
     settings: ServiceSettings = field(default_factory=ServiceSettings)
 
     def __post_init__(self) -> None:
-        for role, number in (("tracker", self.num_trackers), ("mapper", self.num_mappers)):
+        wanted = {
+            "tracker": self.num_trackers,
+            "mapper": self.num_mappers,
+            "gateway": self.num_gateways,
+        }
+        for role, number in wanted.items():
             if number < 1:
                 raise ConfigError(f"at least 1 {role} is needed, got {number}")
         for name, port in (("http_port", self.http_port), ("grpc_port", self.grpc_port)):
@@ -78,11 +84,14 @@ class Services:
     """
 
     def __init__(self, options: LaunchOptions) -> None:
-        ports = free_ports(3)
-        self.http_port = options.http_port or ports[0]
-        self.grpc_port = options.grpc_port or ports[1]
-        self.url = options.access.url(self.http_port)
-        router = options.settings.router_endpoint() or f"tcp/{_HOST}:{ports[2]}"
+        count = options.num_gateways
+        ports = free_ports(1 + 2 * count)
+        self.http_ports = _ports(options.http_port, ports[1 : 1 + count])
+        self.grpc_ports = _ports(options.grpc_port, ports[1 + count :])
+        self.http_port, self.grpc_port = self.http_ports[0], self.grpc_ports[0]
+        self.urls = [options.access.url(port) for port in self.http_ports]
+        self.url = self.urls[0]
+        router = options.settings.router_endpoint() or f"tcp/{_HOST}:{ports[0]}"
         self._processes: list[ServiceProcess] = []
         options.data.mkdir(parents=True, exist_ok=True)
         try:
@@ -151,13 +160,16 @@ class Services:
 
         trackers = [f"tracker-{i}" for i in range(options.num_trackers)]
         mappers = [f"mapper-{i}" for i in range(options.num_mappers)]
-        http = ("--http-host", options.access.host, "--http-port", str(self.http_port))
-        grpc = ("--grpc-port", str(self.grpc_port))
+        doors = [
+            ("--http-host", options.access.host, "--http-port", str(http), "--grpc-port", str(grpc))
+            for http, grpc in zip(self.http_ports, self.grpc_ports, strict=True)
+        ]
+        access = options.access.arguments()
         data = ("--data", str(options.data), "--device", options.device)
         return [
             *(command("tracking", name) for name in trackers),
             *(command("mapping", name, *data) for name in mappers),
-            command("gateway", "gateway-0", *http, *options.access.arguments(), *grpc),
+            *(command("gateway", f"gateway-{i}", *d, *access) for i, d in enumerate(doors)),
         ]
 
 
@@ -165,6 +177,10 @@ def _listen(options: LaunchOptions, router: str) -> tuple[str, ...]:
     settings = options.settings
     where = () if settings.router_endpoint() else ("--listen", router)
     return (*where, *settings.arguments("router"))
+
+
+def _ports(first: int, free: list[int]) -> list[int]:
+    return [first + i for i in range(len(free))] if first else free
 
 
 def free_ports(count: int) -> list[int]:

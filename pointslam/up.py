@@ -18,8 +18,9 @@ def keep_up(options: LaunchOptions, say: Callable[[str], None]) -> None:
     """
     stop = stop_event()
     with Services(options) as services:
-        say(f"http {services.url}  (API: {services.url}/docs)")
-        say(f"grpc {options.access.host}:{services.grpc_port}")
+        for url, grpc_port in zip(services.urls, services.grpc_ports, strict=True):
+            say(f"http {url}  (API: {url}/docs)")
+            say(f"grpc {options.access.host}:{grpc_port}")
         say(f"maps {options.data}, logs {options.logs}; Ctrl-C ends")
         while not stop.wait(_LOOK_EVERY_S):
             for name in services.restart_ended():

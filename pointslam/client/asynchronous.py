@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Any, TypeVar
 
 import httpx
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pointslam.client import calls
 from pointslam.client.async_session import AsyncSession
+from pointslam.client.gateways import Gateways, may_ask_again
 from shared.camera import Calibration
 from shared.errors import UnavailableError
 
@@ -18,12 +19,27 @@ T = TypeVar("T")
 
 
 class AsyncClient:
-    """A gateway; an asynchronous context manager. For `api_key` see `Client`."""
+    """A gateway; an asynchronous context manager. For several, and for `api_key`, see `Client`.
 
-    def __init__(self, url: str = "http://127.0.0.1:8080", api_key: str | None = None) -> None:
-        self.url = url.rstrip("/")
+    A frame stream does not go on by itself at another gateway: open it again.
+    """
+
+    def __init__(
+        self, url: str | Sequence[str] = "http://127.0.0.1:8080", api_key: str | None = None
+    ) -> None:
+        self.gateways = Gateways(url)
         self.headers = calls.key_headers(api_key)
         self._http = httpx.AsyncClient(base_url=self.url, headers=self.headers)
+
+    @property
+    def url(self) -> str:
+        """The gateway in use."""
+        return self.gateways.url
+
+    def turn(self) -> None:
+        """Use the next gateway from here on."""
+        self.gateways.turn()
+        self._http.base_url = self.url
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -65,11 +81,17 @@ class AsyncClient:
         Raises:
             PointSlamError: the gateway refused, or does not answer.
         """
-        try:
-            response = await self._http.request(call.method, call.path, **call.arguments())
-        except httpx.TransportError as error:
-            raise self._unreachable(error) from None
-        return call.answer(response)
+        for left in reversed(range(len(self.gateways))):
+            try:
+                return call.answer(
+                    await self._http.request(call.method, call.path, **call.arguments())
+                )
+            except httpx.TransportError as error:
+                unreachable = self._unreachable(error)
+                self.turn()
+                if not left or not may_ask_again(error, call.method):
+                    raise unreachable from None
+        raise AssertionError("there is at least one gateway")
 
     async def lines(self, path: str) -> AsyncIterator[str]:
         """The lines of an event stream as they come.

@@ -14,6 +14,7 @@ from pointslam.client import calls, refinement
 from pointslam.client.frame_stream import stream_frames
 from pointslam.client.messages import FrameOptions, frame_message, localize_message
 from pointslam.client.progress import POLL_S, Progress, pending
+from pointslam.client.resuming import Route, resuming
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.errors import UnavailableError
 from shared.frames import ColourImage, DepthImage
@@ -78,15 +79,21 @@ class Session:
 
         Offline, as many are under way as the gateway gives credit for; live, each is sent when
         `frames` yields it, and a reply may say SUPERSEDED. A refused frame's reply has `error`.
+        Where the client knows several gateways the stream goes on at the next one when it breaks.
 
         Raises:
             UnavailableError: the connection broke.
         """
-        url = calls.stream_url(self._client.url, self.name)
-        credit = self._credit if self.mode == "offline" else None
-        for reply in stream_frames(url, frames, credit, self._client.headers):
+        client = self._client
+        route = Route(self._stream_here, self.trajectory, client.turn, len(client.gateways))
+        for reply in resuming(frames, route):
             self.next_seq = max(self.next_seq, reply.seq + 1)
             yield reply
+
+    def _stream_here(self, frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
+        url = calls.stream_url(self._client.url, self.name)
+        credit = self._credit if self.mode == "offline" else None
+        return stream_frames(url, frames, credit, self._client.headers)
 
     def localize(
         self,

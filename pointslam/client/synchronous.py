@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pointslam.client import calls
+from pointslam.client.gateways import Gateways, may_ask_again
 from pointslam.client.session import Session
 from shared.camera import Calibration
 from shared.errors import UnavailableError
@@ -22,13 +23,26 @@ class Client:
     """A gateway; a context manager. Not for use by several threads at once.
 
     Without `api_key` the one in POINTSLAM_API_KEY is sent, if there is one. A certificate of an
-    authority of your own is trusted by its file in SSL_CERT_FILE.
+    authority of your own is trusted by its file in SSL_CERT_FILE. Of several gateways of one
+    system (a sequence of addresses) another is asked when one does not answer.
     """
 
-    def __init__(self, url: str = "http://127.0.0.1:8080", api_key: str | None = None) -> None:
-        self.url = url.rstrip("/")
+    def __init__(
+        self, url: str | Sequence[str] = "http://127.0.0.1:8080", api_key: str | None = None
+    ) -> None:
+        self.gateways = Gateways(url)
         self.headers = calls.key_headers(api_key)
         self._http = httpx.Client(base_url=self.url, headers=self.headers)
+
+    @property
+    def url(self) -> str:
+        """The gateway in use."""
+        return self.gateways.url
+
+    def turn(self) -> None:
+        """Use the next gateway from here on."""
+        self.gateways.turn()
+        self._http.base_url = self.url
 
     def __enter__(self) -> Client:
         return self
@@ -85,11 +99,15 @@ class Client:
             PointSlamError: the gateway refused.
             UnavailableError: it does not answer.
         """
-        try:
-            response = self._http.request(call.method, call.path, **call.arguments())
-        except httpx.TransportError as error:
-            raise _unreachable(self.url, error) from None
-        return call.answer(response)
+        for left in reversed(range(len(self.gateways))):
+            try:
+                return call.answer(self._http.request(call.method, call.path, **call.arguments()))
+            except httpx.TransportError as error:
+                unreachable = _unreachable(self.url, error)
+                self.turn()
+                if not left or not may_ask_again(error, call.method):
+                    raise unreachable from None
+        raise AssertionError("there is at least one gateway")
 
     def lines(self, path: str) -> Iterator[str]:
         """The lines of an event stream as they come.

@@ -141,3 +141,27 @@ def test_the_owner_takes_frames_of_the_newest_claim_only(gateways, calibration, 
             bus.query(Keys.session(session.name, 1, "advance"), entry, AdvanceReply, 5.0)
 
     assert claim.number == entry.claim + 1
+
+
+def test_a_stream_goes_on_at_another_gateway_when_one_is_killed(calibration, rgb, depth):
+    with ExitStack() as stack:
+        other = stack.enter_context(local_gateway(1))
+        ports = (free_port(), free_port())
+        process = stack.enter_context(gateway_process(other.router, ports))
+        urls = (f"http://127.0.0.1:{ports[0]}", other.url)
+        client = stack.enter_context(Client(urls))
+        while not (client.ready() and client.url == urls[0]):
+            time.sleep(0.02)
+        session = client.create_session(calibration, mode="offline")
+        frames = [session.frame(rgb, depth, (i + 1) * SECOND) for i in range(12)]
+
+        replies = []
+        for reply in session.stream(frames):
+            replies.append(reply)
+            if reply.seq == 5:
+                process.kill()
+
+        assert [reply.seq for reply in replies] == list(range(12))
+        assert {str(reply.status) for reply in replies} == {"TRACKED"}
+        assert client.url == urls[1]
+        assert [record.seq for record in session.trajectory()] == list(range(12))
