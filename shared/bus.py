@@ -89,11 +89,15 @@ class Bus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:
-        """Withdraw everything declared and disconnect."""
+    def withdraw(self) -> None:
+        """Be alive and answer no longer; what is under way can still be answered."""
         for declared in reversed(self._declared):
             declared.undeclare()
         self._declared.clear()
+
+    def close(self) -> None:
+        """Withdraw everything declared and disconnect."""
+        self.withdraw()
         self._session.close()
 
     def query(self, key: str, message: object, kind: type, timeout_s: float) -> Any:

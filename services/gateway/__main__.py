@@ -21,6 +21,7 @@ from services.gateway.access.arguments import (
 from services.gateway.app import create_app, open_sessions
 from services.gateway.config import GatewayConfig
 from services.gateway.grpc_server import GrpcDoor, serve_grpc
+from services.gateway.sessions import Sessions
 from shared.bus import Bus, open_bus
 from shared.errors import UnavailableError
 from shared.service import (
@@ -88,13 +89,19 @@ async def _serve(
     server = _Server(_uvicorn_config(create_app(sessions, door.authority), config, door.tls))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, setattr, server, "should_exit", True)
+        loop.add_signal_handler(number, _drain, sessions, server)
     try:
         async with serve_grpc(sessions, door):
             await server.serve([listener])
     finally:
         forgetting.cancel()
         await sessions.close()
+
+
+def _drain(sessions: Sessions, server: _Server) -> None:
+    """Be ready no longer, then close the door and finish what is under way."""
+    sessions.is_draining = True
+    server.should_exit = True
 
 
 def _uvicorn_config(app: FastAPI, config: GatewayConfig, tls: Tls | None) -> uvicorn.Config:

@@ -70,6 +70,7 @@ class Sessions:
     """
 
     fabric: Fabric
+    is_draining: bool = False  # this process is ending
     _open: dict[str, Session] = field(default_factory=dict)
     # One lock a name, for as long as somebody opens it: no session waits for another's map.
     _opening: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)
@@ -183,7 +184,8 @@ class Sessions:
 
     def is_ready(self) -> bool:
         """Whether a new session could be created and tracked."""
-        return bool(self.fabric.mappers.names and self.fabric.trackers.count())
+        is_staffed = bool(self.fabric.mappers.names and self.fabric.trackers.count())
+        return is_staffed and not self.is_draining
 
     async def close(self) -> None:
         """Let every session finish what it has in flight, then stop serving it."""

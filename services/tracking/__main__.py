@@ -61,6 +61,7 @@ def main(argv: list[str]) -> None:
         bus.declare_alive("tracking", arguments.id)
         announce_ready(arguments.id)
         stop.wait()
+        bus.withdraw()  # no new frame comes while those under way are finished
 
 
 if __name__ == "__main__":

@@ -153,6 +153,26 @@ def test_one_that_leaves_in_the_middle_is_gone(bus, endpoint):
         finish.set()
 
 
+def test_what_is_under_way_is_answered_by_one_that_has_withdrawn(bus, other):
+    asked, finish = threading.Event(), threading.Event()
+
+    def answer(request):
+        asked.set()
+        finish.wait(5.0)
+        return request
+
+    with ThreadPoolExecutor(2) as pool:
+        serve(bus, other, DeleteRequest, answer, pool)
+        question = pool.submit(ask, bus, 5.0)
+        asked.wait(5.0)
+        other.withdraw()
+        is_gone = not is_answered(bus, f"{KEY}/settled")
+        finish.set()
+
+        assert question.result() == DeleteRequest("x")
+        assert is_gone
+
+
 def test_one_that_is_too_slow_times_out(bus, other):
     serve(bus, other, DeleteRequest, lambda request: time.sleep(0.6) or request)
 
