@@ -278,7 +278,8 @@ def test_anchors_grow_in_the_first_part_of_a_refinement_only(calibration, insert
 @pytest.mark.parametrize(("progress", "step"), [(0.0, 0.03), (0.5, 0.015)])
 def test_a_refinement_steps_at_rates_of_its_own_that_decay(calibration, insert, progress, step):
     refinement = RefinementConfig(LearningRates(features=0.03), decay=0.25)
-    mapper = Mapper(calibration, MappingConfig(refinement=refinement), 0, torch.device("cpu"))
+    config = MappingConfig(anchors=AnchorConfig(young_boost=0.0), refinement=refinement)
+    mapper = Mapper(calibration, config, 0, torch.device("cpu"))
     insert(mapper, 0)
     before = mapper.anchors.rows["features"].clone()
 
