@@ -27,6 +27,8 @@ from shared.maps import (
     ExportRequest,
     JobState,
     JobStatus,
+    KeyframeReply,
+    KeyframeRequest,
     MapInfo,
     RefineRequest,
     RenderReply,
@@ -105,11 +107,9 @@ class StandInTracker:
         del self.images[:-100]
         time.sleep(self.delay_s)
         prior = request.T_world_prior
-        status = (
-            LocalizationStatus.COLOUR_ONLY
-            if request.depth is None
-            else (LocalizationStatus.LOCALISED)
-        )
+        status = LocalizationStatus.COLOUR_ONLY
+        if request.depth is not None:
+            status = LocalizationStatus.LOCALISED
         return LocalizeResult(
             status=status if prior is not None else LocalizationStatus.NOT_LOCALISED,
             reason="" if prior is not None else "no keyframe looks like this",
@@ -227,6 +227,7 @@ class StandInMapper:
             "advance": (Advance, lambda entry: self._advance(session, known, entry)),
             "keyframes": (Empty, lambda _: known.poses()),
             "render": (RenderRequest, lambda request: _render(known, request)),
+            "keyframe": (KeyframeRequest, lambda request: _keyframe_image(known, request)),
             "export": (ExportRequest, _export),
             "refine": (RefineRequest, lambda request: _refine(known, request)),
             "refinement": (Empty, lambda _: known.refinement),
@@ -275,6 +276,13 @@ def _render(known: _Map, request: RenderRequest) -> RenderReply:
         rgb, opaque, known_half = rgb[:0], opaque[:0], known_half[:0]
     depth_m = np.full(opaque.shape, 1.5, np.float32)
     return RenderReply(len(known.keyframes()), rgb, depth_m, opaque, known_half, state)
+
+
+def _keyframe_image(known: _Map, request: KeyframeRequest) -> KeyframeReply:
+    found = {entry.record.seq: entry for entry in known.keyframes()}.get(request.seq)
+    if found is None or found.frame is None:
+        raise NotFoundError(f"no keyframe {request.seq}")
+    return KeyframeReply(request.seq, found.record.t_ns, np.eye(4), found.frame.rgb)
 
 
 def _export(request: ExportRequest) -> ExportChunk:

@@ -35,7 +35,8 @@ class Keys:
 
         claim (ClaimRequest, ClaimReply), advance (Advance, AdvanceReply),
         context (ContextRequest, TrackingContext), candidates (CandidatesRequest, Candidates),
-        keyframes (Empty, KeyframePoses), render (RenderRequest, RenderReply),
+        keyframes (Empty, KeyframePoses), keyframe (KeyframeRequest, KeyframeReply),
+        render (RenderRequest, RenderReply),
         export (ExportRequest, ExportChunk),
         refine (RefineRequest, JobStatus), refinement (Empty, JobStatus), interrupt (Empty,
         JobStatus), save (SaveRequest, SaveReply), info (Empty, MapInfo),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.camera import Intrinsics
+from shared.frames import ColourImage
 from shared.tracks import FrameRecord
 
 
@@ -52,6 +53,7 @@ class ExportFormat(StrEnum):
     MESH_GLB = "mesh-glb"  # triangle mesh, binary glTF
     POINTS = "points"  # points of the surface with normals, PLY
     SNAPSHOT = "snapshot"  # tar of the session folder, to resume elsewhere
+    PREVIEW = "preview"  # the splats that show most, without harmonics: quick to make, small
 
 
 SUFFIXES = {
@@ -62,6 +64,7 @@ SUFFIXES = {
     ExportFormat.MESH_GLB: "mesh.glb",
     ExportFormat.POINTS: "points.ply",
     ExportFormat.SNAPSHOT: "tar",
+    ExportFormat.PREVIEW: "preview.ply",
 }
 
 
@@ -86,6 +89,23 @@ class ExportChunk:
     total: int
     bytes: bytes
     export: str = ""  # by this name the next piece is asked for
+
+
+@dataclass(frozen=True)
+class KeyframeRequest:
+    """The recorded image of a keyframe."""
+
+    seq: int
+
+
+@dataclass(frozen=True)
+class KeyframeReply:
+    """What a keyframe's camera saw, as a JPEG without lens distortion, and its present pose."""
+
+    seq: int
+    t_ns: int
+    T_world_camera: NDArray[np.float64]  # [4, 4]
+    rgb: ColourImage
 
 
 @dataclass(frozen=True)

@@ -227,6 +227,7 @@ class KeyframePoses:
     revision: int
     seqs: NDArray[np.int64]  # [K]
     T_world_keyframes: NDArray[np.float64]  # [K, 4, 4]
+    loops: int = 0  # places seen again and joined so far
 
 
 @dataclass(frozen=True)

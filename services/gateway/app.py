@@ -9,9 +9,11 @@ from services.gateway.access.http_guard import HttpGuard
 from services.gateway.access.routes import require_table
 from services.gateway.body_limit import BodyLimit
 from services.gateway.config import GatewayConfig
+from services.gateway.console import console_routes
 from services.gateway.dispatch import TrackerPool
 from services.gateway.http import http_routes
 from services.gateway.job_http import job_routes
+from services.gateway.live_http import live_routes
 from services.gateway.map_http import map_routes
 from services.gateway.members import Members
 from services.gateway.metrics import metrics_routes
@@ -19,6 +21,7 @@ from services.gateway.owner import Fabric
 from services.gateway.problems import add_handlers
 from services.gateway.sessions import Sessions
 from services.gateway.ticket_http import ticket_routes
+from services.gateway.view_socket import view_routes
 from services.gateway.websocket import websocket_routes
 from shared.bus import Bus
 
@@ -52,10 +55,11 @@ def create_app(sessions: Sessions, authority: Authority) -> FastAPI:
         description=_DESCRIPTION,
         redoc_url=None,
     )
-    for routes in (http_routes, map_routes, job_routes, websocket_routes):
+    for routes in (http_routes, live_routes, map_routes, job_routes, websocket_routes, view_routes):
         app.include_router(routes(sessions))
     app.include_router(ticket_routes(authority))
     app.include_router(metrics_routes())
+    app.include_router(console_routes())
     require_table(app.routes)
     add_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=sessions.fabric.config.limits.max_message_bytes)

@@ -87,6 +87,8 @@ class StreamConfig:
     send_timeout_s: float = 5.0  # a client that does not read for so long is cut off
     ping_interval_s: float = 30.0
     event_interval_s: float = 0.25  # between looks at a refinement that somebody watches
+    live_interval_s: float = 0.1  # between looks at a session that somebody watches
+    follow_interval_s: float = 1.0  # a view whose camera rests is drawn again so often
     ping_timeout_s: float = 120.0
     poses: int = 4096  # answered frames kept for `pose?t_ns=`
     max_gap_s: float = 1.0  # poses further apart are not interpolated between

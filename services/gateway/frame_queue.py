@@ -81,9 +81,10 @@ class FrameQueue:
         return 0.0 if self._in_flight is None else time.perf_counter() - self._in_flight.since_s
 
     async def finish(self) -> None:
-        """Wait until every admitted frame is answered."""
-        if self._task is not None:
-            await asyncio.wait([self._task])
+        """Wait until every frame that is here now is answered, whatever comes after."""
+        admitted = [*self._waiting, *([self._in_flight] if self._in_flight else [])]
+        if admitted:
+            await asyncio.wait([waiting.outcome for waiting in admitted])
 
     def resume(self, newest: tuple[int, int]) -> None:
         """Go on behind the newest answered frame (seq, t_ns), whoever answered it."""

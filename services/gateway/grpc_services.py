@@ -223,14 +223,14 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
         """Each new pose, until the client has enough."""
         async with refusing(context):
             session = await self._sessions.get(request.session_id)
-            poses = session.watch()
+            poses = session.poses.watch()
             try:
                 await context.send_initial_metadata(())  # from here on no pose is missed
                 while True:
                     pose = timed_pose_to(await poses.get())
                     yield pose_service_pb2.WatchPosesResponse(pose=pose)
             finally:
-                session.unwatch(poses)
+                session.poses.unwatch(poses)
 
 
 class MapService(map_service_pb2_grpc.MapServiceServicer):

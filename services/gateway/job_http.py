@@ -13,6 +13,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
 from services.gateway.decode import plain
+from services.gateway.events import EventKind
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from shared import codec
@@ -89,7 +90,9 @@ def _add_save_route(router: APIRouter, sessions: Sessions) -> None:
         session = await sessions.get(name)
         await session.flush(config.question_timeout_s)
         wait_s = config.export_timeout_s
-        return codec.to_json(await session.owner.ask("save", SaveRequest(), SaveReply, wait_s))
+        saved: SaveReply = await session.owner.ask("save", SaveRequest(), SaveReply, wait_s)
+        session.live.events.add(EventKind.SAVED, map_revision=saved.revision, bytes=saved.bytes)
+        return codec.to_json(saved)
 
 
 async def _refinement(session: Session, config: GatewayConfig) -> JobStatus:

@@ -9,8 +9,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import numpy as np
+
 from services.gateway.config import GatewayConfig
 from services.gateway.dispatch import TrackerPool
+from services.gateway.events import EventKind, SessionEvents
 from services.gateway.members import Members
 from services.gateway.metrics import TAKEOVERS
 from shared.bus import Bus, Keys
@@ -44,8 +47,9 @@ class Fabric:
 class MapOwner:
     """One session's map: which mapper owns it, in which epoch, at which revision."""
 
-    def __init__(self, fabric: Fabric, opened: OpenReply) -> None:
+    def __init__(self, fabric: Fabric, opened: OpenReply, events: SessionEvents) -> None:
         self.session = opened.session
+        self._events = events
         self.mapper = opened.mapper
         self.epoch = opened.epoch
         self.acknowledged_revision = opened.map_revision
@@ -154,6 +158,7 @@ class MapOwner:
             "%s: map now owned by %s, epoch %d", self.session, opened.mapper, opened.epoch
         )
         TAKEOVERS.inc()
+        self._events.add(EventKind.OWNER_CHANGED, mapper=opened.mapper, epoch=opened.epoch)
         self.take(opened)
         return True
 
@@ -167,8 +172,19 @@ class MapOwner:
             self.logged_seq = opened.last.seq
 
     def _publish(self, poses: KeyframePoses) -> None:
-        if poses.revision >= self.keyframes.revision:
-            self.keyframes = poses
+        if poses.revision < self.keyframes.revision:
+            return
+        if poses.loops > self.keyframes.loops:
+            shift_m = largest_shift_m(self.keyframes, poses)
+            self._events.add(EventKind.LOOP_CLOSED, loops=poses.loops, max_shift_m=shift_m)
+        self.keyframes = poses
+
+
+def largest_shift_m(old: KeyframePoses, new: KeyframePoses) -> float:
+    """How far the keyframe moved that moved most, metres."""
+    _, in_old, in_new = np.intersect1d(old.seqs, new.seqs, return_indices=True)
+    moved = new.T_world_keyframes[in_new, :3, 3] - old.T_world_keyframes[in_old, :3, 3]
+    return float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
 
 async def open_new(fabric: Fabric, request: OpenRequest, mappers: Sequence[str]) -> OpenReply:

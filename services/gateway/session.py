@@ -15,6 +15,7 @@ from services.gateway.dispatch import Limits
 from services.gateway.errors import detail
 from services.gateway.frame_queue import FrameQueue, Outcome
 from services.gateway.frame_reply import reply_of
+from services.gateway.live_view import LiveView
 from services.gateway.localizer import Localizer
 from services.gateway.owner import Fabric, MapOwner
 from services.gateway.pose_feed import PoseFeed
@@ -47,7 +48,8 @@ class Session:
         self.calibration = opened.calibration
         self.created_ns = opened.created_ns
         self.is_live = opened.mode == "live"
-        self.owner = MapOwner(fabric, opened)
+        self.live = LiveView(opened.calibration.colour.intrinsics)
+        self.owner = MapOwner(fabric, opened, self.live.events)
         self._fabric = fabric
         self._T_world_first = opened.T_world_first
         self._delivery = Delivery(self.owner, fabric.config.mapping)
@@ -155,14 +157,6 @@ class Session:
         """
         return self.poses.pose(self.owner.keyframes, t_ns)
 
-    def watch(self) -> asyncio.Queue[TimedPose]:
-        """A queue that receives each new pose; a slow reader loses the oldest."""
-        return self.poses.watch()
-
-    def unwatch(self, queue: asyncio.Queue[TimedPose]) -> None:
-        """Stop a queue of `watch`."""
-        self.poses.unwatch(queue)
-
     def state(self) -> dict[str, Any]:
         """The tracking side of the session as plain values."""
         prior = self._prior
@@ -214,7 +208,10 @@ class Session:
         total_ms = 1e3 * (time.perf_counter() - start)
         reply = reply_of(result, {"queue": waited_ms, "gateway": total_ms})
         problem = self._delivery.problem
-        return reply if problem is None else dataclasses.replace(reply, map_problem=detail(problem))
+        if problem is not None:
+            reply = dataclasses.replace(reply, map_problem=detail(problem))
+        self.live.show(frame, reply)
+        return reply
 
     def _take_up(self, opened: OpenReply) -> None:
         """Remember what the owner knows, and nothing else."""
@@ -237,6 +234,7 @@ class Session:
             self._lose_claim()
         if self._claim == 0 and news.record is not None:
             self.poses.add(news.record, news.map_revision, self.owner.keyframes)
+            self.live.events.hear(news.record.seq, news.record.status)
 
     def _lose_claim(self) -> None:
         if self._claim > 0:

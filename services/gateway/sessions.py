@@ -133,14 +133,26 @@ class Sessions:
                 if session.is_idle(idle_s):
                     self._open.pop(name).close()
 
+    def is_serving(self, session: Session) -> bool:
+        """Whether a session that was got is still served here."""
+        return self._open.get(session.owner.session) is session and not self.is_draining
+
     async def list(self) -> list[dict[str, Any]]:
-        """Every session of the caller's tenant on the live mappers, newest first."""
+        """Every session of the caller's tenant on the live mappers, newest first.
+
+        `tracking` is of those that are served here, else None.
+        """
         found: dict[str, dict[str, Any]] = {}
         for mapper in sorted(self.fabric.mappers.names):
             for summary in (await self._list_of(mapper)).sessions:
                 name = public_name(summary.session)
                 if is_callers(summary.session) and (name not in found or summary.is_open):
-                    found[name] = codec.to_json(summary) | {"session": name, "mapper": mapper}
+                    served = self._open.get(summary.session)
+                    found[name] = codec.to_json(summary) | {
+                        "session": name,
+                        "mapper": mapper,
+                        "tracking": served.live.pulse.state() if served else None,
+                    }
         return sorted(found.values(), key=lambda row: -row["created_ns"])
 
     async def delete(self, name: str) -> None:
@@ -178,7 +190,8 @@ class Sessions:
         """The map's state with the tracking side's under `tracking`, as plain JSON values."""
         timeout_s = self.fabric.config.mapping.question_timeout_s
         info: MapInfo = await session.owner.ask("info", Empty(), MapInfo, timeout_s)
-        tracking = session.state() | {"credit": self.fabric.config.stream.credit}
+        credit = {"credit": self.fabric.config.stream.credit}
+        tracking = session.state() | session.live.pulse.state() | credit
         own = {"session": session.name, "created_ns": session.created_ns, "tracking": tracking}
         return codec.to_json(info) | own
 

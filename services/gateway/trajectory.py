@@ -50,3 +50,18 @@ def trajectory_file(trajectory: Trajectory, format: TrajectoryFormat, kind: str)
         if record.status in HAS_POSE
     ]
     return trajectory_text(poses, format)
+
+
+def path_json(trajectory: Trajectory, max_points: int) -> dict[str, Any]:
+    """Runs of positions of the final poses, metres; a run ends where the camera was lost."""
+    step = -(-len(trajectory.records) // max_points)
+    runs: list[list[list[float]]] = [[]]
+    for i, (record, T) in enumerate(
+        zip(trajectory.records, trajectory.T_world_cameras_final, strict=True)
+    ):
+        if record.status not in HAS_POSE:
+            runs.append([])
+        elif i % max(step, 1) == 0:
+            runs[-1].append([round(float(c), 4) for c in T[:3, 3]])
+    last = trajectory.records[-1].seq if trajectory.records else -1
+    return {"last_seq": last, "runs": [run for run in runs if run]}

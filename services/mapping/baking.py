@@ -79,7 +79,7 @@ def bake(copy: MapCopy, degree: int) -> Iterator[BakedGaussians]:
 @torch.no_grad()
 def _baked(copy: MapCopy, block: Tensor, degree: int) -> BakedGaussians:
     """The Gaussians of anchors that show."""
-    made, children = _as_made(copy, block), copy.painter.anchors.config.children
+    made, children = as_made(copy, block), copy.painter.anchors.config.children
     fitted = _fitted(copy, block, made.colours.view(len(block), -1), degree)
     harmonics = fitted.view(len(block), -1, children, 3).transpose(1, 2).flatten(0, 1)
     shows = made.opacities > MIN_OPACITY
@@ -88,7 +88,7 @@ def _baked(copy: MapCopy, block: Tensor, degree: int) -> BakedGaussians:
     )
 
 
-def _as_made(copy: MapCopy, block: Tensor) -> Gaussians:
+def as_made(copy: MapCopy, block: Tensor) -> Gaussians:
     """The Gaussians of anchors, as the keyframes that made them see them."""
     creators, centres = copy.painter.anchors.rows["creator"][block], copy.centres()
     children = copy.painter.anchors.config.children

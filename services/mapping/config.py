@@ -181,10 +181,12 @@ class ExportConfig:
     harmonics_degree: int = (
         3  # of the colours in a PLY of splats; 0 makes the file 3.6 times smaller
     )
+    preview_splats: int = 60_000  # at most, in a preview: 68 bytes each
 
     def __post_init__(self) -> None:
         fine = 0 <= self.harmonics_degree <= 3
         _check(fine, f"export.harmonics_degree must be 0 to 3, got {self.harmonics_degree}")
+        _check(self.preview_splats > 0, "export.preview_splats must be positive")
 
 
 @dataclass(frozen=True)

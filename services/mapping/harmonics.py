@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 MAX_DEGREE = 3
-_C0 = 0.28209479177387814
+CONSTANT = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (
@@ -20,7 +20,7 @@ _C3 = (
 def basis(directions: Tensor, degree: int) -> Tensor:
     """The (degree + 1)^2 functions at unit `directions` [N, 3] from camera to Gaussian, [N, B]."""
     x, y, z = directions.unbind(1)
-    functions = [torch.full_like(x, _C0)]
+    functions = [torch.full_like(x, CONSTANT)]
     if degree > 0:
         functions += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree > 1:
@@ -42,7 +42,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 def mean_colour(harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
     """The colour over all directions, [N, 3], of coefficients [N, B, 3]."""
-    return 0.5 + np.float32(_C0) * harmonics[:, 0]
+    return 0.5 + np.float32(CONSTANT) * harmonics[:, 0]
 
 
 class LeastSquares:

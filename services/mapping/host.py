@@ -16,6 +16,7 @@ from services.mapping.janitor import Janitor
 from services.mapping.leases import open_lease_store
 from services.mapping.log import count_keyframes
 from services.mapping.opening import check_same, new_record
+from services.mapping.priority import give_way
 from services.mapping.retention import is_pinned, overdue, set_pinned, stored_session
 from services.mapping.served import Served, answers, withdraw
 from services.mapping.session import Session, Surroundings
@@ -29,12 +30,7 @@ from services.mapping.storage import (
 )
 from services.mapping.tenure import Lease, Tenure
 from shared.bus import Bus, Keys
-from shared.errors import (
-    NotFoundError,
-    PointSlamError,
-    StorageError,
-    UnavailableError,
-)
+from shared.errors import NotFoundError, PointSlamError, StorageError, UnavailableError
 from shared.maps import (
     DeleteRequest,
     Empty,
@@ -50,7 +46,7 @@ from shared.tracks import (
 
 LOGGER = logging.getLogger(__name__)
 _QUERY_THREADS = 8
-_SLOW_THREADS = {"render": 2, "export": 2, "save": 2}  # must not keep trackers waiting for contexts
+_SLOW_THREADS = {"render": 2, "keyframe": 1, "export": 2, "save": 2}  # contexts never wait for them
 
 
 @dataclass(frozen=True)
@@ -72,8 +68,9 @@ class MapperHost:
         self._lock = threading.Lock()
         self._served: dict[str, Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
+        lower = (give_way, (settings.config.owner.niceness,))
         self._slow = {
-            question: ThreadPoolExecutor(threads, thread_name_prefix=question)
+            question: ThreadPoolExecutor(threads, question, *lower)
             for question, threads in _SLOW_THREADS.items()
         }
         owner = settings.config.owner

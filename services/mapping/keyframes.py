@@ -136,6 +136,7 @@ class KeyframeStore:
             revision=self.revision,
             seqs=np.array(self.seqs(), np.int64),
             T_world_keyframes=np.array(poses, np.float64).reshape(-1, 4, 4),
+            loops=self.num_loops,
         )
 
     def seqs(self) -> list[int]:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.mapping.contexts import Contexts
 from services.mapping.entries import check_entry
@@ -165,6 +166,15 @@ class Ledger:
         """Present poses of all keyframes."""
         with self._lock:
             return self._store.poses()
+
+    def pose(self, seq: int) -> NDArray[np.float64]:
+        """Present pose of a keyframe, T_world_camera, [4, 4].
+
+        Raises:
+            NotFoundError: no such keyframe.
+        """
+        with self._lock:
+            return self._store.pose(seq)
 
     def context(self, request: ContextRequest) -> TrackingContext:
         """The neighbourhood of a keyframe.

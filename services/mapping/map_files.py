@@ -7,6 +7,7 @@ from typing import BinaryIO
 from services.mapping.baking import MapCopy, bake
 from services.mapping.config import ExportConfig
 from services.mapping.mesh import Visit, cloud_ply, mesh_glb, mesh_ply
+from services.mapping.preview import preview
 from services.mapping.splat_gltf import write_gltf
 from services.mapping.splat_ply import write_ply
 from services.mapping.splat_spz import write_spz
@@ -36,6 +37,9 @@ def write_map(file: BinaryIO, format: ExportFormat, visit: Visit, config: Export
     """
     if format in _SURFACES:
         file.write(_SURFACES[format](visit))
+        return
+    if format is ExportFormat.PREVIEW:
+        write_ply(file, [Splats.of(preview(visit(MapCopy.of), config.preview_splats))], 0)
         return
     degree = config.harmonics_degree
     _SPLATS[format](file, map(Splats.of, bake(visit(MapCopy.of), degree)), degree)

@@ -12,6 +12,7 @@ from services.mapping.session import Session
 from shared.maps import (
     Empty,
     ExportRequest,
+    KeyframeRequest,
     RefineRequest,
     RenderRequest,
     SaveRequest,
@@ -49,6 +50,7 @@ def answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]]
         ("candidates", CandidatesRequest, ledger.candidates),
         ("keyframes", Empty, lambda _: ledger.poses()),
         ("render", RenderRequest, session.render),
+        ("keyframe", KeyframeRequest, session.images.answer),
         ("export", ExportRequest, session.export),
         ("refine", RefineRequest, session.refine),
         ("refinement", Empty, lambda _: session.refinement),

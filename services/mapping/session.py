@@ -16,6 +16,7 @@ from services.mapping.config import MappingConfig
 from services.mapping.export import pack_folder, spooled
 from services.mapping.exports import Exports
 from services.mapping.figures import MapFigures
+from services.mapping.keyframe_images import KeyframeImages
 from services.mapping.ledger import Ledger, Resumed
 from services.mapping.map_files import write_map
 from services.mapping.metrics import SNAPSHOT_SECONDS
@@ -84,6 +85,7 @@ class Session:
         resumed, ended = self.ledger.resumed.refinement, self._worth_saving.set
         refinement = Refinement(folder.path, resumed, lease.check, ended)
         self._worker = MapWorker(mapper, refinement, self.record.mode, config)
+        self.images = KeyframeImages(self._worker, self.ledger, self.record.calibration)
         self._take_up(mapper)
         self._calm = threading.Lock()  # held while a snapshot wants no new entries
         self._saving = threading.Lock()

@@ -22,8 +22,9 @@ from services.mapping.map_state import MapState
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.priority import give_way
 from services.mapping.refinement import Refinement
+from services.mapping.training_views import TrainingView
 from services.mapping.turns import Turns
-from shared.errors import UnavailableError
+from shared.errors import NotFoundError, UnavailableError
 from shared.maps import JobStatus
 
 LOGGER = logging.getLogger(__name__)
@@ -104,6 +105,17 @@ class MapWorker:
         """Ask the mapper something between two of its steps."""
         with self._turns.visit():
             return question(self._mapper)
+
+    def keyframe(self, seq: int) -> TrainingView:
+        """A keyframe of the map; waits while entries are pending that may bring it.
+
+        Raises:
+            NotFoundError: there is none of that seq.
+        """
+        self._wait(lambda: seq in self._mapper.views or self.pending == 0)
+        if seq not in self._mapper.views:
+            raise NotFoundError(f"no keyframe {seq} in the map")
+        return self._mapper.views[seq]
 
     def capture(self) -> tuple[MapState, JobStatus]:
         """The map and its refinement at one moment.

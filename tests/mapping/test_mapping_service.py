@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shared.bus import Bus, GoneError, Keys, open_bus, open_router
@@ -21,6 +22,8 @@ from shared.maps import (
     ExportChunk,
     ExportFormat,
     ExportRequest,
+    KeyframeReply,
+    KeyframeRequest,
     MapInfo,
     RenderReply,
     RenderRequest,
@@ -125,6 +128,10 @@ def ask(bus: Bus, opening: OpenReply, question: str, message, kind):
     return bus.query(key, message, kind, 30.0)
 
 
+def count_in(ply: bytes) -> int:
+    return int(ply.split(b"element vertex ", 1)[1].split(b"\n", 1)[0])
+
+
 def test_every_acknowledged_keyframe_survives_kill_9(start, bus, calibration, entry):
     process = start()
     before = opened(bus, calibration)
@@ -165,11 +172,16 @@ def test_a_session_answers_every_question(shared_mapper, bus, calibration, entry
     view = ask(bus, opening, "render", request, RenderReply)
     info = ask(bus, opening, "info", Empty(), MapInfo)
     chunk = ask(bus, opening, "export", ExportRequest(ExportFormat.PLY), ExportChunk)
+    preview = ask(bus, opening, "export", ExportRequest(ExportFormat.PREVIEW), ExportChunk)
+    keyframe = ask(bus, opening, "keyframe", KeyframeRequest(4), KeyframeReply)
 
     assert (context.num_keyframes, poses.seqs.tolist()) == (2, [0, 4])
     assert (view.alpha > 200).mean() > 0.8
     assert (info.frames, info.keyframes, info.mapper) == (5, 2, "shared")
     assert chunk.bytes.startswith(b"ply\n")
+    assert 100 < count_in(preview.bytes) <= count_in(chunk.bytes)
+    assert keyframe.rgb.bytes.startswith(b"\xff\xd8")
+    np.testing.assert_allclose(keyframe.T_world_camera, poses.T_world_keyframes[1])
 
 
 def test_refused_requests_name_what_is_wrong(shared_mapper, bus, calibration, entry):
@@ -182,6 +194,8 @@ def test_refused_requests_name_what_is_wrong(shared_mapper, bus, calibration, en
         opened(bus, None, "nowhere", shared_mapper)
     with pytest.raises(ConflictError, match="not newer"):
         advance(bus, opening, entry(3))
+    with pytest.raises(NotFoundError, match="keyframe 5"):
+        ask(bus, opening, "keyframe", KeyframeRequest(5), KeyframeReply)
 
 
 def test_a_deleted_session_is_gone(shared_mapper, bus, calibration, entry):
