@@ -1,0 +1,98 @@
+/** This device's camera, found again and again in a map that exists. */
+
+import { withAccess } from "../access.js";
+import { getJson, request, sessionPath } from "../api.js";
+import { byId, make, setText } from "../dom.js";
+import { DASH, fixed, length, percent } from "../text.js";
+import { Camera } from "./camera.js";
+import { pack } from "./msgpack.js";
+
+const PAUSE_MS = 300;
+const TONES = { LOCALISED: "good", COLOUR_ONLY: "good", NOT_LOCALISED: "warn" };
+const WORDS = { LOCALISED: "found", COLOUR_ONLY: "found by colour alone", NOT_LOCALISED: "not found" };
+
+const camera = new Camera(byId("video"));
+let isOn = false;
+
+function tell(text, tone = "") {
+  setText(byId("state"), text);
+  byId("state").dataset.tone = tone;
+}
+
+async function listMaps() {
+  const { sessions } = await withAccess(() => getJson("/v1/sessions"));
+  const maps = sessions.filter((row) => row.keyframes > 0);
+  byId("map").replaceChildren(...maps.map((row) =>
+    make("option", { value: row.session }, `${row.session} (${row.keyframes} keyframes)`)));
+  byId("start").disabled = maps.length === 0;
+  const none = "Depth is needed to make a map, and there is none yet to find this camera in.";
+  setText(byId("note"), maps.length ? "" : none);
+}
+
+async function toggle() {
+  if (isOn) { stop(); return; }
+  try {
+    await camera.start();
+  } catch (error) {
+    tell("no camera", "bad");
+    setText(byId("picture-note"), error.message);
+    return;
+  }
+  isOn = true;
+  setText(byId("start"), "Stop");
+  byId("picture").dataset.state = "shown";
+  tell("looking");
+  await keepLooking();
+}
+
+function stop() {
+  isOn = false;
+  camera.stop();
+  setText(byId("start"), "Start");
+  byId("picture").dataset.state = "empty";
+  tell("camera is off");
+}
+
+/** One picture at a time: the next is taken when the one before is answered. */
+async function keepLooking() {
+  while (isOn) {
+    try {
+      if (!document.hidden) show(await localize());
+      setText(byId("note"), "");
+    } catch (error) {
+      setText(byId("note"), error.message);
+    }
+    await new Promise((resume) => setTimeout(resume, PAUSE_MS));
+  }
+}
+
+async function localize() {
+  const { jpeg, intrinsics } = await camera.picture(byId("field-of-view").valueAsNumber);
+  const message = { rgb: { encoding: "jpeg", bytes: jpeg }, camera: { intrinsics } };
+  const response = await request(sessionPath(byId("map").value, "localize"), {
+    method: "POST",
+    body: pack(message),
+    headers: { "Content-Type": "application/msgpack", Accept: "application/json" },
+  });
+  return response.json();
+}
+
+function show(answer) {
+  if (!isOn) return;
+  tell(WORDS[answer.status], TONES[answer.status]);
+  const at = answer.T_map_camera?.position;
+  const rows = [
+    ["Position", at ? `${fixed(at.x, 2)}, ${fixed(at.y, 2)}, ${fixed(at.z, 2)} m` : DASH],
+    ["Position, 1 σ", length(answer.pos_std_m)],
+    ["Inliers", at ? `${answer.inliers} (${percent(answer.inlier_share)})` : DASH],
+    ["Answer", `${fixed(answer.timings_ms.gateway)} ms`],
+    ["Why not", answer.reason || DASH],
+  ];
+  byId("answer").dataset.status = answer.status;
+  byId("answer").replaceChildren(...rows.map(([name, value]) =>
+    make("div", {}, make("dt", {}, name), make("dd", {}, value))));
+}
+
+byId("start").addEventListener("click", toggle);
+listMaps().catch((error) => { tell("not ready", "bad"); setText(byId("note"), error.message); })
+  .finally(() => { document.body.dataset.ready = "true"; });

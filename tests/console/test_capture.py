@@ -1,0 +1,52 @@
+"""The capture page: a browser's camera, found or not in a map, on a gateway with stand-ins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.local_gateway import local_gateway
+from pointslam.client import Client
+from shared.camera import Calibration, Camera, Intrinsics
+
+pytestmark = pytest.mark.system
+
+CALIBRATION = Calibration(Camera(Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)), depth_scale=1000.0)
+RGB, DEPTH = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 1500, np.uint16)
+
+
+@pytest.fixture(scope="module")
+def gateway():
+    with local_gateway(1) as running, Client(running.url) as client:
+        while not client.ready():
+            pass
+        yield running
+
+
+def open_capture(browser, gateway):
+    browser.open(f"{gateway.url}/capture")
+    browser.wait_for("location.pathname === '/capture' && document.body?.dataset.ready === 'true'")
+
+
+def test_without_a_map_it_says_that_depth_is_needed(browser, gateway):
+    open_capture(browser, gateway)
+
+    assert browser.text("#note").startswith("Depth is needed to make a map")
+    assert browser.run("document.getElementById('start').disabled")
+
+
+def test_the_camera_is_looked_for_in_the_chosen_map(browser, gateway, pictures):
+    with Client(gateway.url) as client:
+        session = client.create_session(CALIBRATION, name="kitchen")
+        session.track(RGB, DEPTH, 1)
+        open_capture(browser, gateway)
+        browser.click("#start")
+
+        browser.wait_for("document.getElementById('answer').dataset.status")
+
+    browser.screenshot(pictures / "capture.jpg")
+    asked = gateway.trackers[0].images[-1].calibration.colour.intrinsics
+    assert (asked.width, asked.height) == (640, 480)
+    assert browser.text("#state") == "not found"
+    assert "no keyframe looks like this" in browser.text("#answer")
+    assert browser.errors == []
