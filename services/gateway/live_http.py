@@ -117,7 +117,7 @@ class _LiveEvents:
 
     async def stream(self) -> AsyncIterator[str]:
         """Text of events for as long as the session is served here."""
-        with self._session.in_use():
+        with self._session.usage.held():
             async for text in self._texts():
                 yield text
 

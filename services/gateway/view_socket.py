@@ -74,7 +74,7 @@ def view_routes(sessions: Sessions) -> APIRouter:
             await websocket.send_denial_response(problem_response(error))
             return
         await websocket.accept()
-        with session.in_use():
+        with session.usage.held():
             await ViewStream(websocket, session, sessions.fabric.config).run()
 
     return router
