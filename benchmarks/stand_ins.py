@@ -18,6 +18,7 @@ from shared import se3
 from shared.bus import Bus, Keys
 from shared.errors import ClaimLostError, ConflictError, NotFoundError
 from shared.frames import HAS_POSE, TrackingStatus, TrackRequest
+from shared.georeference import Georeference, GeoreferenceReply, GeoreferenceRequest
 from shared.images import decode_colour, decode_depth
 from shared.localization import LocalizationStatus, LocalizeRequest, LocalizeResult
 from shared.maps import (
@@ -130,6 +131,7 @@ class _Map:
     claim: int = 0
     entries: list[Advance] = field(default_factory=list)
     refinement: JobStatus = field(default_factory=JobStatus)
+    georeference: Georeference | None = None
     stops: list = field(default_factory=list)
 
     def keyframes(self) -> list[Advance]:
@@ -234,6 +236,7 @@ class StandInMapper:
             "interrupt": (Empty, lambda _: known.refinement),
             "save": (SaveRequest, lambda _: SaveReply(len(known.keyframes()), 1000)),
             "info": (Empty, lambda _: self._info(session, known)),
+            "georeference": (GeoreferenceRequest, lambda request: _locate(known, request)),
             "trajectory": (TrajectoryRequest, lambda _: _trajectory(known)),
         }
         known.stops = [
@@ -283,6 +286,11 @@ def _keyframe_image(known: _Map, request: KeyframeRequest) -> KeyframeReply:
     if found is None or found.frame is None:
         raise NotFoundError(f"no keyframe {request.seq}")
     return KeyframeReply(request.seq, found.record.t_ns, np.eye(4), found.frame.rgb)
+
+
+def _locate(known: _Map, request: GeoreferenceRequest) -> GeoreferenceReply:
+    known.georeference = request.new or known.georeference
+    return GeoreferenceReply(known.georeference)
 
 
 def _export(request: ExportRequest) -> ExportChunk:

@@ -11,6 +11,7 @@ from services.gateway.body_limit import BodyLimit
 from services.gateway.config import GatewayConfig
 from services.gateway.console import console_routes
 from services.gateway.dispatch import TrackerPool
+from services.gateway.geo_http import geo_routes
 from services.gateway.http import http_routes
 from services.gateway.job_http import job_routes
 from services.gateway.live_http import live_routes
@@ -18,6 +19,7 @@ from services.gateway.map_http import map_routes
 from services.gateway.members import Members
 from services.gateway.metrics import metrics_routes
 from services.gateway.owner import Fabric
+from services.gateway.pose_http import pose_routes
 from services.gateway.problems import add_handlers
 from services.gateway.sessions import Sessions
 from services.gateway.ticket_http import ticket_routes
@@ -57,6 +59,8 @@ def create_app(sessions: Sessions, authority: Authority) -> FastAPI:
     )
     for routes in (http_routes, live_routes, map_routes, job_routes, websocket_routes, view_routes):
         app.include_router(routes(sessions))
+    app.include_router(pose_routes(sessions))
+    app.include_router(geo_routes(sessions))
     app.include_router(ticket_routes(authority))
     app.include_router(metrics_routes())
     app.include_router(console_routes())

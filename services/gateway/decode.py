@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
+from starlette.requests import Request
 
 from services.gateway.errors import MESSAGE, TooLargeError
 from shared import codec
@@ -85,6 +86,18 @@ def _max_bytes(calibration: Calibration) -> int:
 def plain(kind: type[T], value: Any) -> T:
     """A dataclass from JSON, with field names as the client wrote them."""
     return named_from(kind, codec.from_plain, value)
+
+
+async def read_json(request: Request) -> Any:
+    """A request's body.
+
+    Raises:
+        InputError: it is no JSON.
+    """
+    try:
+        return await request.json()
+    except (ValueError, RecursionError) as error:
+        raise InputError(MESSAGE, f"not JSON ({str(error)[:200]})") from None
 
 
 def named_from(kind: type[T], convert: Any, value: Any) -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 _INTRINSICS = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
@@ -106,6 +107,64 @@ LOCALIZE: dict[str, Any] = {
             }
         }
     },
+}
+
+_POSE = {
+    "position": {"x": 0.4, "y": -0.1, "z": 1.9},
+    "orientation": {"x": 0.0, "y": 0.38, "z": 0.0, "w": 0.92},
+}
+_TIMED_POSE = {
+    "seq": 120,
+    "t_ns": 4_000_000_000,
+    "status": "TRACKED",
+    "frame": "opencv",
+    "T_map_camera": _POSE,
+    "T_map_odom": None,
+    "pos_std_m": 0.004,
+    "rot_std_deg": 0.1,
+    "reference_seq": 112,
+    "map_revision": 58,
+    "is_interpolated": False,
+}
+
+
+def _answer(media_type: str, example: Any, status: int = 200) -> dict[int | str, dict[str, Any]]:
+    return {status: {"content": {media_type: {"example": example}}}}
+
+
+POSE = _answer("application/json", _TIMED_POSE)
+
+POSE_EVENTS = _answer("text/event-stream", f"event: pose\ndata: {json.dumps(_TIMED_POSE)}\n\n")
+
+GEOPOSE = _answer(
+    "application/json",
+    {
+        "position": {"lat": 48.2621, "lon": 11.6679, "h": 482.3},
+        "quaternion": {"x": -0.65, "y": 0.27, "z": 0.27, "w": 0.65},
+        "accuracy": {"pos_std_m": 0.004, "rot_std_deg": 0.1},
+        "frame": "opencv",
+        "t_ns": 4_000_000_000,
+        "status": "TRACKED",
+    },
+)
+
+GEOREFERENCE: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {"type": "object", "required": ["lat", "lon", "h"]},
+                "examples": {
+                    "by compass": {
+                        "value": {"lat": 48.2621, "lon": 11.6679, "h": 482.3, "heading_deg": 45.0}
+                    },
+                    "whole": {
+                        "value": {"lat": 48.2621, "lon": 11.6679, "h": 482.3, "T_enu_map": _POSE}
+                    },
+                },
+            }
+        },
+    }
 }
 
 TICKET: dict[int | str, dict[str, Any]] = {

@@ -15,6 +15,7 @@ from services.gateway.frame_stream import FrameStream, SlowClientError
 from services.gateway.grpc_errors import refusing
 from services.gateway.localizer import check_localize
 from services.gateway.map_queries import ask_render, export_pieces
+from services.gateway.pose_watch import correction, follow, watched
 from services.gateway.session import Session
 from services.gateway.sessions import CreateRequest, Sessions
 from services.gateway.views import View, mean_confidence
@@ -210,8 +211,10 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
     async def GetPose(self, request: Any, context: Any) -> Any:
         """The newest pose."""
         async with refusing(context):
-            pose = (await self._sessions.get(request.session_id)).pose()
-            return pose_service_pb2.GetPoseResponse(pose=timed_pose_to(pose))
+            session = await self._sessions.get(request.session_id)
+            T_map_odom = correction(session.prior, session.owner.keyframes)
+            pose = timed_pose_to(session.pose(), T_map_odom)
+            return pose_service_pb2.GetPoseResponse(pose=pose)
 
     async def GetPoseAt(self, request: Any, context: Any) -> Any:
         """The pose at a time."""
@@ -220,17 +223,18 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
             return pose_service_pb2.GetPoseAtResponse(pose=timed_pose_to(pose))
 
     async def WatchPoses(self, request: Any, context: Any) -> AsyncIterator[Any]:
-        """Each new pose, until the client has enough."""
+        """Each new pose, and the newest again when the map has moved it."""
         async with refusing(context):
             session = await self._sessions.get(request.session_id)
-            poses = session.poses.watch()
-            try:
+            look_every_s = self._sessions.fabric.config.stream.event_interval_s
+            with watched(session) as poses:
                 await context.send_initial_metadata(())  # from here on no pose is missed
-                while True:
-                    pose = timed_pose_to(await poses.get())
-                    yield pose_service_pb2.WatchPosesResponse(pose=pose)
-            finally:
-                session.poses.unwatch(poses)
+                async for news in follow(session, poses, look_every_s):
+                    if news is not None:
+                        pose = timed_pose_to(news.pose, news.T_map_odom)
+                        yield pose_service_pb2.WatchPosesResponse(
+                            pose=pose, is_correction=news.is_correction
+                        )
 
 
 class MapService(map_service_pb2_grpc.MapServiceServicer):

@@ -6,19 +6,22 @@ import asyncio
 from dataclasses import replace
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Query, Request
+from numpy.typing import NDArray
 from starlette.responses import JSONResponse, Response
 
 from services.gateway import examples
 from services.gateway.access.caller import current_caller
-from services.gateway.decode import plain, read_frame
-from services.gateway.errors import MESSAGE
+from services.gateway.axes import Axes, in_axes
+from services.gateway.decode import plain, read_frame, read_json
 from services.gateway.localizer import read_localize
+from services.gateway.pose_watch import correction
 from services.gateway.poses import TimedPose
 from services.gateway.sessions import CreateRequest, Sessions
 from services.gateway.trajectory import fetch_trajectory, trajectory_file, trajectory_json
 from shared import codec
-from shared.errors import InputError, UnavailableError
+from shared.errors import UnavailableError
 from shared.se3 import Pose
 from shared.trajectories import TrajectoryFormat
 
@@ -38,7 +41,7 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
     @router.post("/v1/sessions", status_code=201, openapi_extra=examples.CREATE_SESSION)
     async def create_session(request: Request) -> Response:
         """Create a session with the device's calibration."""
-        create = plain(CreateRequest, await _json(request))
+        create = plain(CreateRequest, await read_json(request))
         session = await sessions.create(create)
         location = {"Location": f"/v1/sessions/{session.name}"}
         return JSONResponse(await sessions.info(session), 201, location)
@@ -91,10 +94,19 @@ def _add_session_routes(router: APIRouter, sessions: Sessions) -> None:
 
 
 def _add_pose_routes(router: APIRouter, sessions: Sessions) -> None:
-    @router.get("/v1/sessions/{name}/pose")
-    async def get_pose(name: str, t_ns: int | None = None) -> dict[str, Any]:
-        """The newest pose, or the pose at a time of the client's clock, interpolated."""
-        return pose_json((await sessions.get(name)).pose(t_ns))
+    @router.get("/v1/sessions/{name}/pose", responses=examples.POSE)
+    async def get_pose(
+        name: str, t_ns: int | None = None, frame: Axes = Axes.OPENCV
+    ) -> dict[str, Any]:
+        """The newest pose, or the pose at a time of the client's clock, interpolated.
+
+        `frame` names the axes of camera and map: opencv (right, down, forward), opengl (right, up,
+        backward; OpenXR too) or ros (forward, left, up). `T_map_odom` corrects the odometry of a
+        device that sends it, as of now.
+        """
+        session = await sessions.get(name)
+        T_map_odom = correction(session.prior, session.owner.keyframes)
+        return pose_json(session.pose(t_ns), frame, T_map_odom)
 
     @router.get("/v1/sessions/{name}/trajectory")
     async def get_trajectory(name: str) -> Response:
@@ -134,14 +146,18 @@ def _add_health_routes(router: APIRouter, sessions: Sessions) -> None:
         return {"status": "ready", **members}
 
 
-def pose_json(pose: TimedPose) -> dict[str, Any]:
-    """A pose as plain JSON values, with named quaternion fields."""
+def pose_json(
+    pose: TimedPose, axes: Axes, T_map_odom: NDArray[np.float64] | None
+) -> dict[str, Any]:
+    """A pose in some convention's axes as plain JSON values, with named quaternion fields."""
     deviation = pose.deviations()
     return {
         "seq": pose.seq,
         "t_ns": pose.t_ns,
         "status": str(pose.status),
-        "T_map_camera": codec.to_json(Pose.from_matrix(pose.T_map_camera)),
+        "frame": str(axes),
+        "T_map_camera": _pose_in(pose.T_map_camera, axes),
+        "T_map_odom": None if T_map_odom is None else _pose_in(T_map_odom, axes),
         "pos_std_m": deviation[0] if deviation else None,
         "rot_std_deg": deviation[1] if deviation else None,
         "reference_seq": pose.reference_seq,
@@ -150,15 +166,12 @@ def pose_json(pose: TimedPose) -> dict[str, Any]:
     }
 
 
+def _pose_in(T: NDArray[np.float64], axes: Axes) -> dict[str, Any]:
+    return codec.to_json(Pose.from_matrix(in_axes(T, axes)))
+
+
 def _reply(request: Request, reply: object) -> Response:
     """Msgpack, or JSON where that is accepted."""
     if "json" in request.headers.get("accept", ""):
         return JSONResponse(codec.to_json(reply))
     return Response(codec.pack(reply), media_type=MSGPACK)
-
-
-async def _json(request: Request) -> Any:
-    try:
-        return await request.json()
-    except (ValueError, RecursionError) as error:
-        raise InputError(MESSAGE, f"not JSON ({str(error)[:200]})") from None

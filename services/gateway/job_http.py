@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from services.gateway import examples
 from services.gateway.config import GatewayConfig
-from services.gateway.decode import plain
+from services.gateway.decode import plain, read_json
 from services.gateway.events import EventKind
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
@@ -45,10 +45,7 @@ def _add_refine_routes(router: APIRouter, sessions: Sessions) -> None:
     async def refine(name: str, request: Request) -> Response:
         """Start to optimise on all keyframes; it goes on when its owner dies and is replaced."""
         session = await sessions.get(name)
-        try:
-            wanted = plain(RefineRequest, await request.json())
-        except ValueError as error:
-            raise InputError("message", f"not JSON ({str(error)[:200]})") from None
+        wanted = plain(RefineRequest, await read_json(request))
         if not 0 < wanted.iterations <= limits.max_refine_iterations:
             raise InputError("iterations", f"must be 1 to {limits.max_refine_iterations}")
         await session.flush(timeout_s)

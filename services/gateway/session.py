@@ -24,7 +24,7 @@ from services.gateway.prior import next_prior, resumed_prior
 from services.gateway.usage import Usage
 from shared.bus import Keys
 from shared.errors import ClaimLostError, PointSlamError, UnavailableError
-from shared.frames import Frame, TrackRequest
+from shared.frames import Frame, Prior, TrackRequest
 from shared.localization import LocalizeMessage, LocalizeReply
 from shared.stream import FrameMessage, FrameReply
 from shared.tracing import log_fields, span
@@ -156,6 +156,11 @@ class Session:
             NotFoundError: there is none.
         """
         return self.poses.pose(self.owner.keyframes, t_ns)
+
+    @property
+    def prior(self) -> Prior | None:
+        """What is known of the camera since the last frame with a pose; None before it."""
+        return self._prior
 
     def state(self) -> dict[str, Any]:
         """The tracking side of the session as plain values."""

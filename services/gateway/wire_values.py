@@ -215,8 +215,10 @@ def _detail_message(detail: ErrorDetail | None) -> types_pb2.ErrorDetail | None:
     return types_pb2.ErrorDetail(code=detail.code, field=detail.field, reason=detail.reason)
 
 
-def timed_pose_to(pose: TimedPose) -> pose_service_pb2.TimedPose:
-    """A pose at a time."""
+def timed_pose_to(
+    pose: TimedPose, T_map_odom: NDArray[np.float64] | None = None
+) -> pose_service_pb2.TimedPose:
+    """A pose at a time, with the correction of the device's odometry where it is known."""
     deviation = pose.deviations()
     return pose_service_pb2.TimedPose(
         seq=pose.seq,
@@ -228,4 +230,5 @@ def timed_pose_to(pose: TimedPose) -> pose_service_pb2.TimedPose:
         reference_seq=pose.reference_seq,
         map_revision=pose.map_revision,
         is_interpolated=pose.is_interpolated,
+        T_map_odom=None if T_map_odom is None else pose_to(T_map_odom),
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from services.mapping.config import MappingConfig
+from services.mapping.georeference import georeference_answer
 from services.mapping.janitor import Janitor
 from services.mapping.leases import open_lease_store
 from services.mapping.log import count_keyframes
@@ -239,7 +240,8 @@ class MapperHost:
             raise
         served = Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
         record = session.record
-        for question, kind, answer in answers(session):
+        located = georeference_answer(folder, lease.check)
+        for question, kind, answer in (*answers(session), located):
             executor = self._slow.get(question, self._queries)
             executor = served.advances if question == "advance" else executor
             key = Keys.session(record.session, record.epoch, question)

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from shared.wire import types_pb2 as pointslam_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fpointslam/v1/pose_service.proto\x12\x0cpointslam.v1\x1a\x18pointslam/v1/types.proto\"\x94\x02\n\tTimedPose\x12\x0b\n\x03seq\x18\x01 \x01(\x03\x12\x0c\n\x04t_ns\x18\x02 \x01(\x03\x12,\n\x06status\x18\x03 \x01(\x0e\x32\x1c.pointslam.v1.TrackingStatus\x12(\n\x0cT_map_camera\x18\x04 \x01(\x0b\x32\x12.pointslam.v1.Pose\x12\x16\n\tpos_std_m\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x18\n\x0brot_std_deg\x18\x06 \x01(\x01H\x01\x88\x01\x01\x12\x15\n\rreference_seq\x18\x07 \x01(\x03\x12\x14\n\x0cmap_revision\x18\x08 \x01(\x03\x12\x17\n\x0fis_interpolated\x18\t \x01(\x08\x42\x0c\n\n_pos_std_mB\x0e\n\x0c_rot_std_deg\"$\n\x0eGetPoseRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"8\n\x0fGetPoseResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose\"4\n\x10GetPoseAtRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04t_ns\x18\x02 \x01(\x03\":\n\x11GetPoseAtResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose\"\'\n\x11WatchPosesRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\";\n\x12WatchPosesResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose2\xf6\x01\n\x0bPoseService\x12\x46\n\x07GetPose\x12\x1c.pointslam.v1.GetPoseRequest\x1a\x1d.pointslam.v1.GetPoseResponse\x12L\n\tGetPoseAt\x12\x1e.pointslam.v1.GetPoseAtRequest\x1a\x1f.pointslam.v1.GetPoseAtResponse\x12Q\n\nWatchPoses\x12\x1f.pointslam.v1.WatchPosesRequest\x1a .pointslam.v1.WatchPosesResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fpointslam/v1/pose_service.proto\x12\x0cpointslam.v1\x1a\x18pointslam/v1/types.proto\"\xd0\x02\n\tTimedPose\x12\x0b\n\x03seq\x18\x01 \x01(\x03\x12\x0c\n\x04t_ns\x18\x02 \x01(\x03\x12,\n\x06status\x18\x03 \x01(\x0e\x32\x1c.pointslam.v1.TrackingStatus\x12(\n\x0cT_map_camera\x18\x04 \x01(\x0b\x32\x12.pointslam.v1.Pose\x12\x16\n\tpos_std_m\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x18\n\x0brot_std_deg\x18\x06 \x01(\x01H\x01\x88\x01\x01\x12\x15\n\rreference_seq\x18\x07 \x01(\x03\x12\x14\n\x0cmap_revision\x18\x08 \x01(\x03\x12\x17\n\x0fis_interpolated\x18\t \x01(\x08\x12+\n\nT_map_odom\x18\n \x01(\x0b\x32\x12.pointslam.v1.PoseH\x02\x88\x01\x01\x42\x0c\n\n_pos_std_mB\x0e\n\x0c_rot_std_degB\r\n\x0b_T_map_odom\"$\n\x0eGetPoseRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"8\n\x0fGetPoseResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose\"4\n\x10GetPoseAtRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04t_ns\x18\x02 \x01(\x03\":\n\x11GetPoseAtResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose\"\'\n\x11WatchPosesRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\"R\n\x12WatchPosesResponse\x12%\n\x04pose\x18\x01 \x01(\x0b\x32\x17.pointslam.v1.TimedPose\x12\x15\n\ris_correction\x18\x02 \x01(\x08\x32\xf6\x01\n\x0bPoseService\x12\x46\n\x07GetPose\x12\x1c.pointslam.v1.GetPoseRequest\x1a\x1d.pointslam.v1.GetPoseResponse\x12L\n\tGetPoseAt\x12\x1e.pointslam.v1.GetPoseAtRequest\x1a\x1f.pointslam.v1.GetPoseAtResponse\x12Q\n\nWatchPoses\x12\x1f.pointslam.v1.WatchPosesRequest\x1a .pointslam.v1.WatchPosesResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,19 +33,19 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'pointslam.v1.pose_service_p
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TIMEDPOSE']._serialized_start=76
-  _globals['_TIMEDPOSE']._serialized_end=352
-  _globals['_GETPOSEREQUEST']._serialized_start=354
-  _globals['_GETPOSEREQUEST']._serialized_end=390
-  _globals['_GETPOSERESPONSE']._serialized_start=392
-  _globals['_GETPOSERESPONSE']._serialized_end=448
-  _globals['_GETPOSEATREQUEST']._serialized_start=450
-  _globals['_GETPOSEATREQUEST']._serialized_end=502
-  _globals['_GETPOSEATRESPONSE']._serialized_start=504
-  _globals['_GETPOSEATRESPONSE']._serialized_end=562
-  _globals['_WATCHPOSESREQUEST']._serialized_start=564
-  _globals['_WATCHPOSESREQUEST']._serialized_end=603
-  _globals['_WATCHPOSESRESPONSE']._serialized_start=605
-  _globals['_WATCHPOSESRESPONSE']._serialized_end=664
-  _globals['_POSESERVICE']._serialized_start=667
-  _globals['_POSESERVICE']._serialized_end=913
+  _globals['_TIMEDPOSE']._serialized_end=412
+  _globals['_GETPOSEREQUEST']._serialized_start=414
+  _globals['_GETPOSEREQUEST']._serialized_end=450
+  _globals['_GETPOSERESPONSE']._serialized_start=452
+  _globals['_GETPOSERESPONSE']._serialized_end=508
+  _globals['_GETPOSEATREQUEST']._serialized_start=510
+  _globals['_GETPOSEATREQUEST']._serialized_end=562
+  _globals['_GETPOSEATRESPONSE']._serialized_start=564
+  _globals['_GETPOSEATRESPONSE']._serialized_end=622
+  _globals['_WATCHPOSESREQUEST']._serialized_start=624
+  _globals['_WATCHPOSESREQUEST']._serialized_end=663
+  _globals['_WATCHPOSESRESPONSE']._serialized_start=665
+  _globals['_WATCHPOSESRESPONSE']._serialized_end=747
+  _globals['_POSESERVICE']._serialized_start=750
+  _globals['_POSESERVICE']._serialized_end=996
 # @@protoc_insertion_point(module_scope)

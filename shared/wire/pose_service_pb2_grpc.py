@@ -71,7 +71,8 @@ class PoseServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def WatchPoses(self, request, context):
-        """Each new pose; a slow reader loses the oldest.
+        """Each new pose, and the newest again when the map has moved it (a loop was closed, a keyframe
+        adjusted): what a robot follows. A slow reader loses the oldest.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
