@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.empty_keyframe import empty_keyframe
+from benchmarks.stand_in_answers import Place, export_piece
 from shared import se3
 from shared.bus import Bus, Keys
 from shared.errors import ClaimLostError, ConflictError, NotFoundError
 from shared.frames import HAS_POSE, TrackingStatus, TrackRequest
-from shared.georeference import Georeference, GeoreferenceReply, GeoreferenceRequest
+from shared.georeference import GeoreferenceRequest
 from shared.images import decode_colour, decode_depth
 from shared.localization import LocalizationStatus, LocalizeRequest, LocalizeResult
 from shared.maps import (
     DeleteRequest,
     Empty,
-    ExportChunk,
     ExportRequest,
     JobState,
     JobStatus,
@@ -131,7 +131,7 @@ class _Map:
     claim: int = 0
     entries: list[Advance] = field(default_factory=list)
     refinement: JobStatus = field(default_factory=JobStatus)
-    georeference: Georeference | None = None
+    place: Place = field(default_factory=Place)
     stops: list = field(default_factory=list)
 
     def keyframes(self) -> list[Advance]:
@@ -230,13 +230,13 @@ class StandInMapper:
             "keyframes": (Empty, lambda _: known.poses()),
             "render": (RenderRequest, lambda request: _render(known, request)),
             "keyframe": (KeyframeRequest, lambda request: _keyframe_image(known, request)),
-            "export": (ExportRequest, _export),
+            "export": (ExportRequest, export_piece),
             "refine": (RefineRequest, lambda request: _refine(known, request)),
             "refinement": (Empty, lambda _: known.refinement),
             "interrupt": (Empty, lambda _: known.refinement),
             "save": (SaveRequest, lambda _: SaveReply(len(known.keyframes()), 1000)),
             "info": (Empty, lambda _: self._info(session, known)),
-            "georeference": (GeoreferenceRequest, lambda request: _locate(known, request)),
+            "georeference": (GeoreferenceRequest, known.place.answer),
             "trajectory": (TrajectoryRequest, lambda _: _trajectory(known)),
         }
         known.stops = [
@@ -286,15 +286,6 @@ def _keyframe_image(known: _Map, request: KeyframeRequest) -> KeyframeReply:
     if found is None or found.frame is None:
         raise NotFoundError(f"no keyframe {request.seq}")
     return KeyframeReply(request.seq, found.record.t_ns, np.eye(4), found.frame.rgb)
-
-
-def _locate(known: _Map, request: GeoreferenceRequest) -> GeoreferenceReply:
-    known.georeference = request.new or known.georeference
-    return GeoreferenceReply(known.georeference)
-
-
-def _export(request: ExportRequest) -> ExportChunk:
-    return ExportChunk(request.offset, 3000, bytes([request.offset // 1000]) * 1000, "1")
 
 
 def _refine(known: _Map, request: RefineRequest) -> JobStatus:

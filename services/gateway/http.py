@@ -147,7 +147,7 @@ def _add_health_routes(router: APIRouter, sessions: Sessions) -> None:
 
 
 def pose_json(
-    pose: TimedPose, axes: Axes, T_map_odom: NDArray[np.float64] | None
+    pose: TimedPose, axes: Axes = Axes.OPENCV, T_map_odom: NDArray[np.float64] | None = None
 ) -> dict[str, Any]:
     """A pose in some convention's axes as plain JSON values, with named quaternion fields."""
     deviation = pose.deviations()

@@ -35,8 +35,16 @@ def pose_routes(sessions: Sessions) -> APIRouter:
         """
         session = await sessions.get(name)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        events = _events(session, frame, config.event_interval_s, config.ping_interval_s)
-        return StreamingResponse(events, 200, headers, "text/event-stream")
+
+        async def events() -> AsyncIterator[str]:
+            every_s = (config.event_interval_s, config.ping_interval_s)
+            async for event in _events(session, frame, *every_s):
+                if not sessions.is_serving(session):
+                    return
+                if event:
+                    yield event
+
+        return StreamingResponse(events(), 200, headers, "text/event-stream")
 
     return router
 
@@ -51,9 +59,9 @@ async def _events(
             quiet_s = 0.0 if news else quiet_s + look_every_s
             if news is not None:
                 yield _event(news, axes)
-            elif quiet_s >= ping_every_s:
-                quiet_s = 0.0
-                yield ": nothing new\n\n"
+            else:  # a look that finds nothing is told too: the stream may have to end
+                yield ": nothing new\n\n" if quiet_s >= ping_every_s else ""
+                quiet_s = quiet_s % ping_every_s
 
 
 def _event(news: WatchedPose, axes: Axes) -> str:

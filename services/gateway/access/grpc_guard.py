@@ -9,13 +9,15 @@ from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import grpc
+from google.protobuf.message import DecodeError
 
 from services.gateway.access import audit
 from services.gateway.access.authority import Authority, Shown
 from services.gateway.access.caller import CALLER, Caller
 from services.gateway.access.routes import ADMIN, ANY, GRPC, OPEN, Access
+from services.gateway.errors import MESSAGE
 from services.gateway.grpc_errors import refusing
-from shared.errors import PointSlamError
+from shared.errors import InputError, PointSlamError
 
 _Continue = Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler | None]]
 
@@ -56,15 +58,18 @@ class _Guarded:
             make, behaviour = grpc.unary_stream_rpc_method_handler, handler.unary_stream
         else:
             make, behaviour = grpc.unary_unary_rpc_method_handler, handler.unary_unary
-        guarded = self._stream(behaviour) if _is_generator(behaviour) else self._call(behaviour)
-        return make(guarded, handler.request_deserializer, handler.response_serializer)
+        parsed = _parsing(behaviour, handler)
+        guarded = self._stream(parsed) if _is_generator(behaviour) else self._call(parsed)
+        # Without a deserializer grpc hands us the bytes: its own would blame the server for bad
+        # ones (INTERNAL), and would read those of strangers before they are asked who they are.
+        return make(guarded, None, handler.response_serializer)
 
     def _call(self, behaviour: Any) -> Callable[[Any, Any], Awaitable[Any]]:
         async def call(request: Any, context: Any) -> Any:
             caller = await self._admit(context)
             outcome = "OK"
             try:
-                async with self._while_valid(caller, context):
+                async with refusing(context), self._while_valid(caller, context):
                     return await behaviour(request, context)
             except BaseException:
                 outcome = getattr(context.code(), "name", "INTERNAL")
@@ -78,7 +83,7 @@ class _Guarded:
     def _stream(self, behaviour: Any) -> Callable[[Any, Any], AsyncIterator[Any]]:
         async def stream(request: Any, context: Any) -> AsyncIterator[Any]:
             caller = await self._admit(context)
-            async with self._while_valid(caller, context):
+            async with refusing(context), self._while_valid(caller, context):
                 async for response in behaviour(request, context):
                     yield response
 
@@ -115,6 +120,24 @@ class _Guarded:
             yield
         finally:
             watching.cancel()
+
+
+def _parsing(behaviour: Any, handler: Any) -> Callable[[Any, Any], Any]:
+    """The behaviour for requests as bytes."""
+
+    async def parsed_all(requests: AsyncIterator[bytes]) -> AsyncIterator[Any]:
+        async for data in requests:
+            yield parse(data)
+
+    def parse(data: bytes) -> Any:
+        try:
+            return handler.request_deserializer(data)
+        except DecodeError as error:
+            raise InputError(MESSAGE, f"is no protobuf message of this call ({error})") from None
+
+    if handler.request_streaming:
+        return lambda requests, context: behaviour(parsed_all(requests), context)
+    return lambda data, context: behaviour(parse(data), context)
 
 
 def _is_generator(behaviour: Any) -> bool:

@@ -1,0 +1,25 @@
+"""What a stand-in's map says of itself: where on Earth it is, and a file of three pieces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from shared.georeference import Georeference, GeoreferenceReply, GeoreferenceRequest
+from shared.maps import ExportChunk, ExportRequest
+
+
+@dataclass
+class Place:
+    """Keeps what it is told."""
+
+    georeference: Georeference | None = None
+
+    def answer(self, request: GeoreferenceRequest) -> GeoreferenceReply:
+        """Take a new one, if there is one; tells the present one."""
+        self.georeference = request.new or self.georeference
+        return GeoreferenceReply(self.georeference)
+
+
+def export_piece(request: ExportRequest) -> ExportChunk:
+    """The piece at an offset."""
+    return ExportChunk(request.offset, 3000, bytes([request.offset // 1000]) * 1000, "1")

@@ -1,0 +1,10 @@
+"""A little of `pointslam bench fuzz`: nonsense at every door is refused and the gateway lives."""
+
+from benchmarks.fuzz import fuzz, problems
+
+
+def test_nonsense_is_never_the_gateways_fault():
+    outcomes = fuzz(inputs=400, seed=1)
+
+    assert problems(outcomes) == []
+    assert all(outcome.answers.total() == 400 for outcome in outcomes.values())
