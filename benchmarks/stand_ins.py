@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.empty_keyframe import empty_keyframe
-from benchmarks.stand_in_answers import Place, export_piece
+from benchmarks.stand_in_answers import Place, export_piece, serve_pins
 from shared import se3
 from shared.bus import Bus, Keys
 from shared.errors import ClaimLostError, ConflictError, NotFoundError
@@ -159,6 +159,7 @@ class StandInMapper:
         bus.serve(Keys.mapper(name, "open"), OpenRequest, self.open)
         bus.serve(Keys.mapper(name, "list"), Empty, self.list)
         bus.serve(Keys.mapper(name, "delete"), DeleteRequest, self.delete)
+        serve_pins(bus, name)
         bus.declare_alive("mapping", name)
 
     def open(self, request: OpenRequest) -> OpenReply:
