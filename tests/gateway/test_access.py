@@ -108,7 +108,9 @@ def bearer(key):
 def status_of(guarded, name, key, query=""):
     """The HTTP status of a route of the table; of a socket that of its refusal."""
     method, path = name.split(" ", 1)
-    url = guarded.url + path.replace("{name}", "kitchen") + query
+    for word, value in {"name": "kitchen", "seq": "0", "format": "tum"}.items():
+        path = path.replace(f"{{{word}}}", value)
+    url = guarded.url + path + query
     if method != "WS":
         return httpx.request(method, url, headers=bearer(key)).status_code
     try:
