@@ -60,6 +60,13 @@ class Page:
         """Begin to load a page."""
         self.send("Page.navigate", url=url)
 
+    def forget(self) -> None:
+        """Leave the page, and forget what it said and loaded."""
+        self.open("about:blank")
+        self.wait_for("location.href === 'about:blank'")
+        self.errors.clear()
+        self.received_bytes = 0
+
     def run(self, script: str) -> Any:
         """The value of an expression in the page; promises are waited for."""
         answer = self.send(

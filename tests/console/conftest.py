@@ -64,6 +64,7 @@ def console(browser, pictures, tmp_path_factory, lit_scene) -> Iterator[Console]
             pass
         session = client.create_session(room.calibration, name="room", T_map_first=room.truth(0))
         browser.resize(1440, 900)
+        browser.forget()
         browser.open(f"{services.url}/")
         browser.wait_for("document.body?.dataset.ready === 'true'")
         frames = (room.frame(i) for i in range(len(room)))

@@ -16,11 +16,12 @@ RGB, DEPTH = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 1500, np.uint16)
 
 
 @pytest.fixture(scope="module")
-def gateway():
+def gateway(browser):
     with local_gateway(1) as running, Client(running.url) as client:
         while not client.ready():
             pass
         yield running
+        browser.forget()
 
 
 def open_capture(browser, gateway):

@@ -116,7 +116,7 @@ def test_saving_tells_of_it_and_is_an_event(page):
     page.click("#save")
 
     page.wait_for("/^Saved/.test(document.getElementById('action-note').textContent)")
-    page.wait_for("document.querySelector('#events [data-kind=saved]')")
+    page.wait_for("document.querySelector('#events [data-kind=saved]') !== null")
 
 
 def test_a_refinement_shows_how_far_it_is_and_ends(page):
