@@ -86,10 +86,15 @@ class Fuzzer:
             for name in self._rng.sample(_QUERIES, self._rng.randrange(4))
         }
         body = json.dumps(spoiled(example, self._rng), default=str) if example else None
-        with self._http.stream(method, path, params=words, content=body) as response:
-            status = response.status_code
-            if "event-stream" not in response.headers.get("content-type", ""):
-                response.read()
+        try:
+            with self._http.stream(method, path, params=words, content=body) as response:
+                status = response.status_code
+                if "event-stream" not in response.headers.get("content-type", ""):
+                    response.read()
+        except httpx.TransportError as error:  # answered and closed while the body was under way
+            is_dead = self._http.get("/healthz").status_code != 200
+            outcome.count(type(error).__name__, is_dead, f"{method} {path} {words}")
+            return
         outcome.count(str(status), status >= 500, f"{method} {path} {words} {body}")
         if status == 201 and "location" in response.headers:
             self._http.delete(response.headers["location"])

@@ -7,7 +7,7 @@ import json
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Header, Path, Query, Request
 from starlette.responses import Response, StreamingResponse
 
 from services.gateway import examples
@@ -53,7 +53,7 @@ def _add_image_routes(router: APIRouter, sessions: Sessions) -> None:
     @router.get(
         "/v1/sessions/{name}/keyframes/{seq}/image", response_class=Response, responses=responses
     )
-    async def keyframe_image(name: str, seq: int) -> Response:
+    async def keyframe_image(name: str, seq: Annotated[int, Path(ge=0, lt=1 << 63)]) -> Response:
         """What a keyframe's camera saw, without lens distortion; its time is in X-Time-Ns."""
         owner = (await sessions.get(name)).owner
         reply: KeyframeReply = await owner.ask(
