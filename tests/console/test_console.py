@@ -154,5 +154,9 @@ def test_a_session_that_does_not_exist_is_told_of(console, page):
 
 
 def test_nothing_of_it_was_an_error_and_it_is_small(page):
+    bytes_of_the_page = page.run(
+        "performance.getEntriesByType('resource').filter((r) => r.name.includes('/web/'))"
+        ".reduce((sum, r) => sum + r.transferSize, 0)"
+    )
     assert page.errors == []
-    assert page.received_bytes < 6_000_000
+    assert 500_000 < bytes_of_the_page < 6_000_000
