@@ -139,7 +139,8 @@ def _metrics() -> Iterator[tuple[str, str]]:
     for collector in list(REGISTRY._collector_to_names):  # no public way to ask for labels
         for metric in getattr(collector, "describe", list)():
             if metric.name.startswith("pointslam_"):
-                labels = ", ".join(getattr(collector, "_labelnames", ("session",)))
+                owner = collector if hasattr(collector, "_labelnames") else metric
+                labels = ", ".join(getattr(owner, "_labelnames", ()))
                 row = f"| `{metric.name}` | {metric.type} | {labels} | {metric.documentation} |"
                 yield metric.name, row
 

@@ -35,6 +35,7 @@ class SessionCollector(Collector):
         """The families without values: registering must not visit a map."""
         for name, text, _ in _GAUGES:
             yield GaugeMetricFamily(f"pointslam_{name}", text, labels=("session",))
+        yield _stages(())
 
     def collect(self) -> Iterator[Metric]:
         """The figures of every open session."""
