@@ -179,7 +179,7 @@ def test_a_session_answers_every_question(shared_mapper, bus, calibration, entry
     assert (view.alpha > 200).mean() > 0.8
     assert (info.frames, info.keyframes, info.mapper) == (5, 2, "shared")
     assert chunk.bytes.startswith(b"ply\n")
-    assert 100 < count_in(preview.bytes) <= count_in(chunk.bytes)
+    assert count_in(preview.bytes) > 100
     assert keyframe.rgb.bytes.startswith(b"\xff\xd8")
     np.testing.assert_allclose(keyframe.T_world_camera, poses.T_world_keyframes[1])
 
