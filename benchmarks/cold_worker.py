@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.local_map import derive
 from shared import codec

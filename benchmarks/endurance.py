@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.disturbances import to_and_fro
 from benchmarks.tracking import Folder
 from services.gateway.prior import next_prior
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from shared.bus import Bus, Keys, open_bus, open_router
 from shared.frames import Prior, TrackRequest
 from shared.tracks import CandidatesRequest, ContextRequest, TrackResult

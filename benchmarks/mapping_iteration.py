@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from services.mapping.anchors import FEATURES, AnchorMap, NewAnchors, trained_widths
+from services.mapping.anchors.anchor_map import FEATURES, AnchorMap, NewAnchors, trained_widths
 from services.mapping.config import AnchorConfig, MappingConfig
-from services.mapping.decoders import NeuralDecoder
-from services.mapping.losses import Appearance, Target, mapping_loss
-from services.mapping.losses_cpu import mapping_loss_cpu
-from services.mapping.optimizer import adam_rows, begin_step
+from services.mapping.decoding.decoders import NeuralDecoder
+from services.mapping.decoding.optimizer import adam_rows, begin_step
+from services.mapping.losses.cpu import mapping_loss_cpu
+from services.mapping.losses.mapping_loss import Appearance, Target, mapping_loss
 from services.mapping.rasterizer import Gaussians, Rasterizer, View
-from services.mapping.render import Painter
+from services.mapping.views.render import Painter
 from shared.rectify import RgbdImage
 
 CHILDREN = 10  # Gaussians per anchor

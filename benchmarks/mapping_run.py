@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pointslam.datasets import FileSequence, is_held_out, open_sequence
 from pointslam.evaluation.protocol import EvaluationOutput, block, novel_block, score_run
 from services.mapping.config import MappingConfig
-from services.mapping.figures import MapFigures
 from services.mapping.pipeline import Mapper, NewKeyframe
+from services.mapping.sessions.figures import MapFigures
 from services.mapping.warm_up import warm_up
 from shared.camera import Intrinsics
 from shared.config import override, read_overrides

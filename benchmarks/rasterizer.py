@@ -26,6 +26,7 @@ import torch
 
 from benchmarks.mapping_iteration import CHILDREN, ITERATION_STAGES, MappingIteration
 from benchmarks.plain_rasterizer import PlainScene, milliseconds, peak_gflops, torch_ssim
+from services.mapping.losses.ssim import SsimTarget, ssim
 from services.mapping.rasterizer import (
     CpuRasterizer,
     Gaussians,
@@ -39,7 +40,6 @@ from services.mapping.rasterizer.scratch import Scratch
 from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import Workers
 from services.mapping.rasterizer.tiles_forward import Images
-from services.mapping.ssim import SsimTarget, ssim
 from shared.camera import Intrinsics
 
 ROOM_M = np.array([4.0, 2.5, 4.0])

@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.disturbances import Plan, Sent, Sequence, disturbed
 from benchmarks.tracking_run import Folder, StoreSource
 from services.gateway.prior import next_prior
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.pipeline import track
 from services.tracking.verification import Step, step_between

@@ -28,10 +28,10 @@ from pointslam.datasets import FileSequence, open_sequence
 from pointslam.synth import SynthOptions, write_sequence
 from services.mapping.config import MappingConfig
 from services.mapping.pipeline import Mapper
-from services.mapping.refinement import Refinement
-from services.mapping.renders import Renders
+from services.mapping.sessions.renders import Renders
+from services.mapping.sessions.worker import OFFLINE, MapWorker
+from services.mapping.storage.refinement import Refinement
 from services.mapping.warm_up import warm_up
-from services.mapping.worker import OFFLINE, MapWorker
 from shared import se3
 from shared.errors import PointSlamError
 from shared.maps import JobStatus, RenderRequest

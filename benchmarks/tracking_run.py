@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.cold_worker import ColdWorker, cold_worker
 from services.gateway.prior import next_prior
-from services.mapping.keyframes import KeyframeConfig, KeyframeStore
+from services.mapping.keyframes.store import KeyframeConfig, KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.executors import NoHelper
 from services.tracking.local_map import LocalMap, derive

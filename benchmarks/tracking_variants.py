@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.peers.registry import PEERS, PeerEntry
 from benchmarks.tracking_run import Folder, Row, absolute_error, relative_errors, run
-from services.mapping.keyframes import KeyframeConfig
-from services.mapping.loop_config import LoopConfig
+from services.mapping.keyframes.loop_config import LoopConfig
+from services.mapping.keyframes.store import KeyframeConfig
 from services.tracking.config import TrackingConfig
 from shared.config import override, read_overrides
 from shared.rectify import rectify

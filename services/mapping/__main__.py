@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 
 from services.mapping.config import MappingConfig
-from services.mapping.host import MapperHost, MapperSettings
 from services.mapping.metrics import SessionCollector
 from services.mapping.priority import others_give_way
+from services.mapping.sessions.host import MapperHost, MapperSettings
 from services.mapping.warm_up import warm_up
 from shared.bus import open_bus
 from shared.errors import ConfigError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-from services.mapping.keyframes import KeyframeConfig
+from services.mapping.keyframes.store import KeyframeConfig
 from shared.errors import ConfigError
 from shared.fabric import BusConfig
 

@@ -16,16 +16,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from services.mapping import densification
-from services.mapping.anchors import AnchorMap, trained_widths
-from services.mapping.appearance import ExposureModel
-from services.mapping.carving import carve
+from services.mapping.anchors import densification
+from services.mapping.anchors.anchor_map import AnchorMap, trained_widths
+from services.mapping.anchors.carving import carve
+from services.mapping.anchors.placement import Placement
+from services.mapping.anchors.seeding import SeedRequest, seed_anchors
 from services.mapping.config import LearningRates, MappingConfig
-from services.mapping.coverage import uncovered_pixels
-from services.mapping.decoders import decoder_for
-from services.mapping.environment import Environment
-from services.mapping.losses import Appearance, Target, mapping_loss
-from services.mapping.losses_cpu import mapping_loss_cpu
+from services.mapping.decoding.decoders import decoder_for
+from services.mapping.decoding.environment import Environment
+from services.mapping.decoding.optimizer import Youth, adam_rows, begin_step
+from services.mapping.losses.cpu import mapping_loss_cpu
+from services.mapping.losses.mapping_loss import Appearance, Target, mapping_loss
 from services.mapping.map_state import (
     MapState,
     as_arrays,
@@ -33,14 +34,13 @@ from services.mapping.map_state import (
     flatten,
     unflatten,
 )
-from services.mapping.optimizer import Youth, adam_rows, begin_step
-from services.mapping.placement import Placement
 from services.mapping.rasterizer import View, rasterizer_for
-from services.mapping.render import Drawn, Painter, to_images
-from services.mapping.render_cache import Moment
-from services.mapping.seeding import SeedRequest, seed_anchors
-from services.mapping.sightings import Sightings
-from services.mapping.training_views import TrainingView, TrainingViews
+from services.mapping.views.appearance import ExposureModel
+from services.mapping.views.coverage import uncovered_pixels
+from services.mapping.views.render import Drawn, Painter, to_images
+from services.mapping.views.render_cache import Moment
+from services.mapping.views.sightings import Sightings
+from services.mapping.views.training_views import TrainingView, TrainingViews
 from shared import se3
 from shared.camera import Calibration
 from shared.frames import Frame

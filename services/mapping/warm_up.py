@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from services.mapping import rasterizer, ssim
+from services.mapping import rasterizer
 from services.mapping.config import MappingConfig
+from services.mapping.losses import ssim
 from services.mapping.pipeline import Mapper, NewKeyframe
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import DepthEncoding, Frame

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.anchors import AnchorMap, NewAnchors, trained_widths
+from services.mapping.anchors.anchor_map import AnchorMap, NewAnchors, trained_widths
+from services.mapping.anchors.depth_fill import filled_depth
+from services.mapping.anchors.rows import RowTable
+from services.mapping.anchors.seeding import SeedRequest, seed_anchors
+from services.mapping.anchors.voxels import centres, level_of, levels_at, sizes_m, voxel_keys
 from services.mapping.config import AnchorConfig, MappingConfig
-from services.mapping.coverage import uncovered
-from services.mapping.decoders import NeuralDecoder, decoder_for
-from services.mapping.depth_fill import filled_depth
+from services.mapping.decoding.decoders import NeuralDecoder, decoder_for
 from services.mapping.rasterizer import Gaussians
 from services.mapping.rasterizer.reference import rotations
-from services.mapping.rows import RowTable
-from services.mapping.seeding import SeedRequest, seed_anchors
-from services.mapping.voxels import centres, level_of, levels_at, sizes_m, voxel_keys
+from services.mapping.views.coverage import uncovered
 from shared import se3
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage

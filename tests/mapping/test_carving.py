@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.anchors import AnchorMap, NewAnchors
-from services.mapping.carving import carve, seen_through
+from services.mapping.anchors.anchor_map import AnchorMap, NewAnchors
+from services.mapping.anchors.carving import carve, seen_through
 from services.mapping.config import AnchorConfig
 from shared import se3
 from shared.camera import Intrinsics

@@ -3,9 +3,9 @@ import time
 import numpy as np
 import pytest
 
-from services.mapping.context import ContextConfig
-from services.mapping.keyframes import KeyframeConfig, KeyframeStore
-from services.mapping.voxel_merge import merge_clouds
+from services.mapping.keyframes.context import ContextConfig
+from services.mapping.keyframes.store import KeyframeConfig, KeyframeStore
+from services.mapping.keyframes.voxel_merge import merge_clouds
 from shared.errors import ConfigError
 from shared.se3 import exp, inverse, transform
 from shared.tracks import (

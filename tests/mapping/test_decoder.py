@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from services.mapping.config import AnchorConfig, DecoderConfig
-from services.mapping.decoder import WEIGHTS, VisibleAnchors, decode, initial_weights
-from services.mapping.decoder_cpu import decode_cpu
+from services.mapping.decoding.cpu import decode_cpu
+from services.mapping.decoding.decoder import WEIGHTS, VisibleAnchors, decode, initial_weights
 
 CAMERA = torch.tensor([0.3, -0.2, -1.0])
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.anchors import AnchorMap, NewAnchors
+from services.mapping.anchors.anchor_map import AnchorMap, NewAnchors
 from services.mapping.config import AnchorConfig, LearningRates, MappingConfig
-from services.mapping.decoder import VisibleAnchors
-from services.mapping.decoders import NeuralDecoder
-from services.mapping.environment import Environment
+from services.mapping.decoding.decoder import VisibleAnchors
+from services.mapping.decoding.decoders import NeuralDecoder
+from services.mapping.decoding.environment import Environment
 
 CPU = torch.device("cpu")
 CENTRE = np.array([0.0, 0.0, -2.0])

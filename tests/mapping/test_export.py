@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.baking import BakedGaussians
-from services.mapping.exports import MAX_OPEN, Exports
+from services.mapping.export.baking import BakedGaussians
+from services.mapping.export.pieces import MAX_OPEN, Exports
+from services.mapping.export.splat_ply import write_ply
+from services.mapping.export.splats import Splats
 from services.mapping.rasterizer import Gaussians
-from services.mapping.splat_ply import write_ply
-from services.mapping.splats import Splats
 from shared.errors import NotFoundError
 
 

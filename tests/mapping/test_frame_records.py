@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.mapping.frame_records import FrameRecords
+from services.mapping.storage.frame_records import FrameRecords
 from shared import se3
 from shared.frames import TrackingStatus
 from shared.tracks import FrameRecord

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from services.mapping.harmonics import LeastSquares, basis
+from services.mapping.export.harmonics import LeastSquares, basis
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from shared.errors import ConflictError, NotFoundError
 from shared.se3 import exp
 from shared.tracks import (

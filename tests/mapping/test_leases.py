@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from services.mapping.leases import LeaseStore, open_lease_store
+from services.mapping.storage.leases import LeaseStore, open_lease_store
 from shared.errors import ConfigError, ConflictError, StorageError
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.mapping.keyframes import KeyframeConfig, KeyframeStore
-from services.mapping.loop_config import LoopConfig
+from services.mapping.keyframes.loop_config import LoopConfig
+from services.mapping.keyframes.store import KeyframeConfig, KeyframeStore
 from shared.errors import NotFoundError
 from shared.se3 import angle_rad, exp, inverse, transform
 from shared.tracks import (

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.appearance import IDENTITY, ExposureModel
 from services.mapping.config import LearningRates, LossConfig
-from services.mapping.losses import Appearance, Target, depth_error, mapping_loss
-from services.mapping.losses_cpu import mapping_loss_cpu
+from services.mapping.losses.cpu import mapping_loss_cpu
+from services.mapping.losses.mapping_loss import Appearance, Target, depth_error, mapping_loss
+from services.mapping.losses.ssim import ssim
+from services.mapping.losses.ssim_torch import ssim_torch
 from services.mapping.rasterizer import Rendered, ScreenStatistics
-from services.mapping.ssim import ssim
-from services.mapping.ssim_torch import ssim_torch
+from services.mapping.views.appearance import IDENTITY, ExposureModel
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping import densification
-from services.mapping.baking import BakedGaussians, MapCopy, bake
+from services.mapping.anchors import densification
 from services.mapping.config import (
     AnchorConfig,
     DensificationConfig,
@@ -18,6 +17,7 @@ from services.mapping.config import (
     RefinementConfig,
     ScheduleConfig,
 )
+from services.mapping.export.baking import BakedGaussians, MapCopy, bake
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.rasterizer import Gaussians, View
 from shared import se3

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from services.mapping.optimizer import Youth, adam_rows, adam_rows_torch, begin_step
-from services.mapping.rows import RowTable
+from services.mapping.anchors.rows import RowTable
+from services.mapping.decoding.optimizer import Youth, adam_rows, adam_rows_torch, begin_step
 
 COLUMN = ((3,), torch.float32)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.mapping.overlap import overlapping, points_of, share_inside
+from services.mapping.views.overlap import overlapping, points_of, share_inside
 from shared import se3
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.anchors import AnchorMap, NewAnchors
+from services.mapping.anchors.anchor_map import AnchorMap, NewAnchors
 from services.mapping.config import AnchorConfig, MappingConfig
-from services.mapping.decoders import NeuralDecoder, PlainDecoder, decoder_for
+from services.mapping.decoding.decoders import NeuralDecoder, PlainDecoder, decoder_for
 from shared.errors import ConfigError
 
 PLAIN = AnchorConfig(gaussians="plain")

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from services.mapping.config import AnchorConfig, DensificationConfig, MappingConfig
-from services.mapping.entries import check_entry
-from services.mapping.optimizer import adam_rows, adam_rows_torch, begin_step
+from services.mapping.decoding.optimizer import adam_rows, adam_rows_torch, begin_step
 from services.mapping.pipeline import Mapper, NewKeyframe
+from services.mapping.storage.entries import check_entry
 from shared import se3
 from shared.errors import InputError
 from shared.frames import DepthEncoding

@@ -2,7 +2,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from services.mapping.pose_graph import (
+from services.mapping.keyframes.pose_graph import (
     PoseGraph,
     PoseGraphConfig,
     exp_twists,

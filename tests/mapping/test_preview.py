@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.preview import _covering_most
+from services.mapping.export.preview import _covering_most
 from services.mapping.rasterizer import Gaussians
 
 

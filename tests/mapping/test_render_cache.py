@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.mapping.config import RenderConfig
-from services.mapping.render_cache import Moment, RenderCache
+from services.mapping.views.render_cache import Moment, RenderCache
 from shared.maps import RenderReply
 
 DRAWN = Moment(revision=3, iterations=100)

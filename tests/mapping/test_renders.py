@@ -12,7 +12,7 @@ import torch
 
 from services.mapping.config import DensificationConfig, MappingConfig, RenderConfig
 from services.mapping.pipeline import Mapper, NewKeyframe
-from services.mapping.renders import Renders
+from services.mapping.sessions.renders import Renders
 from shared.maps import RenderReply, RenderRequest
 from shared.tracks import KeyframePoses
 

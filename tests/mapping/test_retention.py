@@ -9,8 +9,8 @@ import torch
 
 from benchmarks.local_gateway import free_port
 from services.mapping.config import MappingConfig, OwnerConfig, RetentionConfig
-from services.mapping.host import MapperHost, MapperSettings
-from services.mapping.retention import StoredSession, overdue
+from services.mapping.sessions.host import MapperHost, MapperSettings
+from services.mapping.storage.retention import StoredSession, overdue
 from shared.bus import open_bus, open_router
 from shared.maps import DeleteRequest, PinRequest
 from shared.tracks import OpenRequest

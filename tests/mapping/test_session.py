@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from services.mapping.config import MappingConfig, OwnerConfig
-from services.mapping.session import Session, Surroundings
-from services.mapping.storage import SessionFolder, SessionRecord, read_record
-from services.mapping.tenure import Lease
+from services.mapping.sessions.session import Session, Surroundings
+from services.mapping.storage.folders import SessionFolder, SessionRecord, read_record
+from services.mapping.storage.tenure import Lease
 from shared import codec, se3
 from shared.errors import (
     ClaimLostError,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from services.mapping.rasterizer import View
-from services.mapping.sightings import MAX_KEYFRAMES, Sightings
-from services.mapping.training_views import TrainingView
+from services.mapping.views.sightings import MAX_KEYFRAMES, Sightings
+from services.mapping.views.training_views import TrainingView
 from shared import se3
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import DepthEncoding, Frame

@@ -14,13 +14,13 @@ import pytest
 import torch
 import trimesh
 
-from services.mapping.baking import BakedGaussians
-from services.mapping.harmonics import basis
+from services.mapping.export.baking import BakedGaussians
+from services.mapping.export.harmonics import basis
+from services.mapping.export.splat_gltf import write_gltf
+from services.mapping.export.splat_ply import write_ply
+from services.mapping.export.splat_spz import write_spz
+from services.mapping.export.splats import Splats
 from services.mapping.rasterizer import Gaussians
-from services.mapping.splat_gltf import write_gltf
-from services.mapping.splat_ply import write_ply
-from services.mapping.splat_spz import write_spz
-from services.mapping.splats import Splats
 from shared.errors import UnavailableError
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0])

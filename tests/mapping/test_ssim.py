@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from services.mapping.ssim import SsimTarget, ssim
+from services.mapping.losses.ssim import SsimTarget, ssim
 from shared.errors import InputError
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from services.mapping.log import SessionLog, count_keyframes, read_log
 from services.mapping.map_state import MapState
-from services.mapping.snapshot import Snapshot, read_newest, write_snapshot
-from services.mapping.storage import SessionFolder, check_session_name, write_atomically
+from services.mapping.storage.folders import SessionFolder, check_session_name, write_atomically
+from services.mapping.storage.log import SessionLog, count_keyframes, read_log
+from services.mapping.storage.snapshot import Snapshot, read_newest, write_snapshot
 from shared.errors import InputError, StorageError
 
 

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from services.mapping.config import MappingConfig
-from services.mapping.mesh import Visit, cloud_ply, mesh_glb, mesh_ply
+from services.mapping.export.mesh import Visit, cloud_ply, mesh_glb, mesh_ply
 from services.mapping.pipeline import Mapper, NewKeyframe
 from shared.tracks import KeyframePoses
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from services.mapping.leases import open_lease_store
-from services.mapping.tenure import Tenure, is_departed, process_identity
+from services.mapping.storage.leases import open_lease_store
+from services.mapping.storage.tenure import Tenure, is_departed, process_identity
 from shared.errors import ConflictError, GoneError
 
 

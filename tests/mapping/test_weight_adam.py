@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from services.mapping.weight_adam import WeightAdam
+from services.mapping.decoding.weight_adam import WeightAdam
 
 RATES = {"weight": 0.01, "bias": 0.002}
 

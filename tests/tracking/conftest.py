@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.gateway.prior import next_prior
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.executors import NoHelper
 from services.tracking.local_map import LocalMap, derive

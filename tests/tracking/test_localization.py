@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.localization import localize
 from shared.camera import Calibration, Camera

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from services.mapping.keyframes import KeyframeStore
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import RegistrationConfig, TrackingConfig
 from services.tracking.local_map import derive
 from services.tracking.worker import ContextCache, Worker

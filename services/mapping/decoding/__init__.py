@@ -1,0 +1,1 @@
+"""From anchors to Gaussians, and the optimizer of what decodes them."""

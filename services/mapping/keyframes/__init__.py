@@ -1,0 +1,1 @@
+"""Keyframes, their landmarks and local maps, and the loops that move them."""

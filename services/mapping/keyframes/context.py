@@ -1,0 +1,286 @@
+"""The neighbourhood of a keyframe, as tracking wants it: merged cloud, landmarks, window.
+
+Everything here is a function of the keyframes and of the reference, so that the same revision and
+reference always give the same context, in whichever process and after whichever restart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from services.mapping.anchors.membership import is_among
+from services.mapping.keyframes.voxel_merge import merge_clouds
+from shared.errors import ConfigError
+from shared.se3 import inverse, rotate, transform
+from shared.tracks import (
+    KEYPOINT_BITS,
+    Landmarks,
+    Observations,
+    PointCloud,
+    TrackingContext,
+    WindowKeyframe,
+)
+
+
+@dataclass(frozen=True)
+class ContextConfig:
+    """How large a neighbourhood is."""
+
+    voxel_size_m: float = 0.02
+    max_keyframes: int = 16  # whose clouds and landmarks enter
+    min_overlap: float = 0.1  # share of the reference's points that a keyframe may see
+    max_points: int = 60000
+    max_landmarks: int = 4000
+    max_free_keyframes: int = 8  # of the bundle-adjustment window
+    max_fixed_keyframes: int = 7
+    min_shared_landmarks: int = 15  # with the reference, for a place in the window
+    overlap_samples: int = 256
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.voxel_size_m <= 1.0:
+            raise ConfigError(f"voxel_size_m must be 0.001 to 1, got {self.voxel_size_m}")
+        for name in ("max_keyframes", "max_points", "max_landmarks", "max_free_keyframes"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class ViewCone:
+    """What a keyframe can see, from its cloud: bounds of x/z and y/z, and depths."""
+
+    low: NDArray[np.float64]  # [2]
+    high: NDArray[np.float64]  # [2]
+    far_m: float
+    median_m: float
+
+    @staticmethod
+    def of(cloud_camera: PointCloud) -> ViewCone:
+        """The cone of a cloud; of an empty cloud, a cone that sees nothing."""
+        points = cloud_camera.points.astype(np.float64)
+        if len(points) == 0:
+            return ViewCone(np.zeros(2), np.zeros(2), 0.0, 1.0)
+        slopes = points[:, :2] / points[:, 2:]
+        depths = points[:, 2]
+        return ViewCone(
+            slopes.min(axis=0), slopes.max(axis=0), float(depths.max()), float(np.median(depths))
+        )
+
+
+@dataclass(frozen=True)
+class StoredKeyframe:
+    """A keyframe as the map keeps it."""
+
+    seq: int
+    t_ns: int
+    T_world_camera: NDArray[np.float64]  # [4, 4], as corrected last
+    observations: Observations
+    cloud_camera: PointCloud
+    thumbnail: NDArray[np.uint8]  # [15, 20]
+    cone: ViewCone
+    edge_blur_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class LandmarkTable:
+    """All landmarks of a map, by ascending id."""
+
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [L]
+    positions_world: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    normals_world: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+
+    def rows(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The row of each id; -1 where the table does not hold it."""
+        if len(self.ids) == 0:
+            return np.full(len(ids), -1, np.int64)
+        rows = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return np.where(self.ids[rows] == ids, rows, -1)
+
+
+def empty_context(revision: int) -> TrackingContext:
+    """The context of a map without keyframes."""
+    return TrackingContext(
+        revision=revision,
+        reference_seq=-1,
+        T_world_reference=np.eye(4),
+        cloud_world=PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)),
+        landmarks=landmarks_seen(LandmarkTable(), [], np.zeros(0, np.int64)),
+        window=(),
+        num_keyframes=0,
+    )
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """A keyframe among those that a context may be built of."""
+
+    reference: StoredKeyframe
+    near: list[StoredKeyframe]  # itself and all that may take part, by seq
+    first_seq: int  # the first keyframe of the map
+    num_keyframes: int  # of the map
+    loop_seqs: list[int]
+
+
+def build_context(
+    around: Neighbourhood, table: LandmarkTable, revision: int, config: ContextConfig
+) -> TrackingContext:
+    """The context of one keyframe."""
+    near = overlapping(around.reference, around.near, config)
+    ids = _context_landmark_ids(near, table, config)
+    return TrackingContext(
+        revision=revision,
+        reference_seq=around.reference.seq,
+        T_world_reference=around.reference.T_world_camera,
+        cloud_world=_merged_cloud(near, config),
+        landmarks=landmarks_seen(table, near, ids),
+        window=_window(near, ids, around.first_seq, config),
+        num_keyframes=around.num_keyframes,
+        loop_seqs=np.array(around.loop_seqs, np.int64),
+    )
+
+
+def overlapping(
+    reference: StoredKeyframe, keyframes: list[StoredKeyframe], config: ContextConfig
+) -> list[StoredKeyframe]:
+    """The keyframes that see most of the reference's surface, itself first."""
+    cloud = reference.cloud_camera
+    step = max(1, len(cloud.points) // config.overlap_samples)
+    points = transform(reference.T_world_camera, cloud.points[::step].astype(np.float64))
+    normals = rotate(reference.T_world_camera, cloud.normals[::step].astype(np.float64))
+    shares = visible_shares(points, normals, keyframes)
+    order = np.argsort(-shares, kind="stable")
+    chosen = [keyframes[i] for i in order if shares[i] >= config.min_overlap]
+    others = [keyframe for keyframe in chosen if keyframe.seq != reference.seq]
+    return [reference, *others[: config.max_keyframes - 1]]
+
+
+def visible_shares(
+    points_world: NDArray, normals_world: NDArray, keyframes: list[StoredKeyframe]
+) -> NDArray[np.float64]:
+    """Share of the points that lie in each keyframe's cone and face it, [K]."""
+    poses = np.stack([keyframe.T_world_camera for keyframe in keyframes])
+    low = np.stack([keyframe.cone.low for keyframe in keyframes])
+    high = np.stack([keyframe.cone.high for keyframe in keyframes])
+    far = np.array([keyframe.cone.far_m for keyframe in keyframes])
+    counts = _count_visible(points_world, normals_world, inverse(poses), low, high, 1.1 * far)
+    return counts / max(1, len(points_world))
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_visible(  # noqa: PLR0913 - compiled
+    points, normals, views, low, high, far
+):  # pragma: no cover - compiled
+    """How many points lie in each view's cone and face it, [K]."""
+    counts = np.zeros(len(views))
+    for k in range(len(views)):
+        T = views[k]
+        for n in range(len(points)):
+            p, m = points[n], normals[n]
+            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            if z <= 0.05 or z >= far[k]:
+                continue
+            x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+            y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+            u, v = x / z, y / z
+            if u < low[k, 0] or u > high[k, 0] or v < low[k, 1] or v > high[k, 1]:
+                continue
+            facing = x * (T[0, 0] * m[0] + T[0, 1] * m[1] + T[0, 2] * m[2])
+            facing += y * (T[1, 0] * m[0] + T[1, 1] * m[1] + T[1, 2] * m[2])
+            facing += z * (T[2, 0] * m[0] + T[2, 1] * m[1] + T[2, 2] * m[2])
+            if facing < 0.0:
+                counts[k] += 1.0
+    return counts
+
+
+def _merged_cloud(keyframes: list[StoredKeyframe], config: ContextConfig) -> PointCloud:
+    # Voxels are in order of first sight, best overlap first: the tail is what matters least.
+    return merge_clouds(
+        [keyframe.cloud_camera for keyframe in keyframes],
+        [keyframe.T_world_camera for keyframe in keyframes],
+        config.voxel_size_m,
+        config.max_points,
+    )
+
+
+def _context_landmark_ids(
+    near: list[StoredKeyframe], table: LandmarkTable, config: ContextConfig
+) -> NDArray[np.int64]:
+    """Landmarks that the keyframes saw more than once, or that are new; ascending ids."""
+    seen = np.concatenate([keyframe.observations.landmark_ids for keyframe in near])
+    ids, counts = np.unique(seen[seen >= 0], return_counts=True)
+    is_young = (ids >> KEYPOINT_BITS) >= near[0].seq
+    keep = (table.rows(ids) >= 0) & ((counts > 1) | is_young)
+    ids, counts = ids[keep], counts[keep]
+    order = np.argsort(-counts, kind="stable")[: config.max_landmarks]
+    return np.sort(ids[order])
+
+
+def landmarks_seen(
+    table: LandmarkTable, keyframes: list[StoredKeyframe], ids: NDArray[np.int64]
+) -> Landmarks:
+    """The landmarks of ascending ids, described as the first of the keyframes saw them."""
+    rows = table.rows(ids)
+    positions = table.positions_world[rows]
+    descriptors = np.zeros((len(ids), 32), np.uint8)
+    octaves = np.zeros(len(ids), np.uint8)
+    distances = np.zeros(len(ids), np.float32)
+    for keyframe in reversed(keyframes):
+        observations = keyframe.observations
+        at, mine = _rows_of(ids, observations.landmark_ids)
+        descriptors[at] = observations.descriptors[mine]
+        octaves[at] = observations.octaves[mine]
+        distances[at] = np.linalg.norm(positions[at] - keyframe.T_world_camera[:3, 3], axis=1)
+    return Landmarks(ids, positions, table.normals_world[rows], descriptors, octaves, distances)
+
+
+def _rows_of(
+    ids: NDArray[np.int64], observed: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (row in ids, row in observed) of equal ids; ids ascend."""
+    if len(ids) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    at = np.minimum(np.searchsorted(ids, observed), len(ids) - 1)
+    mine = np.flatnonzero(ids[at] == observed)
+    return at[mine], mine
+
+
+def _window(
+    near: list[StoredKeyframe], ids: NDArray[np.int64], first_seq: int, config: ContextConfig
+) -> tuple[WindowKeyframe, ...]:
+    """Bundle-adjustment window: the reference, then the keyframes that share most landmarks."""
+    reference_ids = near[0].observations.landmark_ids
+    reference_ids = reference_ids[reference_ids >= 0]
+    shared = [is_among(k.observations.landmark_ids, reference_ids).sum() for k in near]
+    ranked = [i for i in np.argsort(-np.array(shared), kind="stable") if i > 0]
+    covisible = [near[i] for i in ranked if shared[i] >= config.min_shared_landmarks]
+    free = [near[0], *covisible[: config.max_free_keyframes - 1]]
+    fixed = covisible[config.max_free_keyframes - 1 :][: config.max_fixed_keyframes]
+    members = sorted(free + fixed, key=lambda keyframe: keyframe.seq)
+    # Something must hold the window in place: the first keyframe, or else the oldest.
+    fixed_seqs = {k.seq for k in fixed} | {first_seq}
+    fixed_seqs |= set() if fixed else {members[0].seq}
+    return tuple(
+        WindowKeyframe(
+            seq=keyframe.seq,
+            T_world_camera=keyframe.T_world_camera,
+            is_fixed=keyframe.seq in fixed_seqs,
+            observations=_observations_of(keyframe.observations, ids),
+            edge_blur_px=keyframe.edge_blur_px,
+        )
+        for keyframe in members
+    )
+
+
+def _observations_of(observations: Observations, ids: NDArray[np.int64]) -> Observations:
+    """Those of the given landmarks only; ids ascend."""
+    _, rows = _rows_of(ids, observations.landmark_ids)
+    return Observations(
+        landmark_ids=observations.landmark_ids[rows],
+        keypoints_px=observations.keypoints_px[rows],
+        octaves=observations.octaves[rows],
+        depths_m=observations.depths_m[rows],
+        descriptors=observations.descriptors[rows],
+    )

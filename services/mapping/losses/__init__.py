@@ -1,0 +1,1 @@
+"""What a rendered view is held against."""
