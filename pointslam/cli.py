@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pointslam.cli_client import add_client
+from pointslam.cli_render import add_render_path
 from pointslam.settings import read_settings
 from shared.errors import PointSlamError
 
@@ -42,6 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_synth(commands.add_parser("synth", help="render a procedural room with exact truth"))
     _add_refine(commands.add_parser("refine", help="optimise a session's map further"))
     _add_export(commands.add_parser("export", help="a run's or a session's map as a file"))
+    add_render_path(commands.add_parser("render-path", help="a video along a path in a map"))
     add_client(commands.add_parser("client", help="a camera or a recording to a gateway"))
     _add_convert(commands.add_parser("convert", help="a sequence as an MCAP file"))
     _add_bench(commands.add_parser("bench", help="measure one part"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterable, AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from pointslam.client import calls, refinement
+from pointslam.client import calls, path_render, refinement
 from pointslam.client.frame_stream import refusal
 from pointslam.client.messages import FrameOptions, frame_message, localize_message
 from pointslam.client.progress import POLL_S, Progress, pending
 from shared import codec
 from shared.camera import Calibration, Camera, Intrinsics
-from shared.errors import UnavailableError
+from shared.errors import NotFoundError, UnavailableError
 from shared.frames import ColourImage, DepthImage
 from shared.localization import LocalizeReply
 from shared.maps import ExportFormat, JobStatus, RenderReply
+from shared.path_renders import PathRenderRequest
 from shared.stream import FrameMessage, FrameReply
 
 if TYPE_CHECKING:
@@ -116,6 +117,24 @@ class AsyncSession:
         """A view of the map; without intrinsics, through the session's colour camera."""
         call = calls.render(self.name, T_world_camera, intrinsics, appearance_t_ns)
         return await self._client.call(call)
+
+    async def render_path(
+        self, request: PathRenderRequest, progress: Progress | None = None
+    ) -> AsyncIterator[bytes]:
+        """The file with views along a path, piece by piece; see `Session.render_path`."""
+        status = await self._client.call(path_render.start(self.name, request))
+        try:
+            while status.is_running:
+                await asyncio.sleep(POLL_S)
+                status = await self._client.call(path_render.status(self.name, status.job))
+                if progress is not None:
+                    progress(status.frames_done, status.frames_total)
+            file = path_render.file_path(self.name, path_render.succeeded(status).job)
+            async for piece in self._client.download(file, {}):
+                yield piece
+        finally:
+            with suppress(NotFoundError, UnavailableError):
+                await self._client.call(path_render.cancel(self.name, status.job))
 
     async def info(self) -> dict[str, Any]:
         """State of the map (fields of MapInfo) and of tracking."""

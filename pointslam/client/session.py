@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pointslam.client import calls, refinement
+from pointslam.client import calls, path_render, refinement
 from pointslam.client.frame_stream import stream_frames
 from pointslam.client.messages import FrameOptions, frame_message, localize_message
 from pointslam.client.progress import POLL_S, Progress, pending
 from pointslam.client.resuming import Route, resuming
 from shared.camera import Calibration, Camera, Intrinsics
-from shared.errors import UnavailableError
+from shared.errors import NotFoundError, UnavailableError
 from shared.frames import ColourImage, DepthImage
 from shared.localization import LocalizeReply
 from shared.maps import ExportFormat, JobStatus, RenderReply
+from shared.path_renders import PathRenderRequest, PathRenderStatus
 from shared.stream import FrameMessage, FrameReply
 
 if TYPE_CHECKING:
@@ -148,6 +150,32 @@ class Session:
         return self._client.call(
             calls.render(self.name, T_world_camera, intrinsics, appearance_t_ns)
         )
+
+    def render_path(
+        self, request: PathRenderRequest, path: Path | str, progress: Progress | None = None
+    ) -> PathRenderStatus:
+        """Draw views along a path into a file: a video, or a zip of pictures and their poses.
+
+        What ends this call early (Ctrl-C) ends the drawing too.
+
+        Raises:
+            InputError: the request does not fit the session; names the field.
+            ConflictError: another path of the session is being drawn.
+            PointSlamError: drawing failed.
+        """
+        status = self._client.call(path_render.start(self.name, request))
+        try:
+            while status.is_running:
+                time.sleep(POLL_S)
+                status = self._client.call(path_render.status(self.name, status.job))
+                if progress is not None:
+                    progress(status.frames_done, status.frames_total)
+            file = path_render.file_path(self.name, path_render.succeeded(status).job)
+            self._client.download(file, {}, Path(path))
+        finally:
+            with suppress(NotFoundError, UnavailableError):  # a gateway that is gone draws nothing
+                self._client.call(path_render.cancel(self.name, status.job))
+        return status
 
     def info(self) -> dict[str, Any]:
         """State of the map (fields of MapInfo) and of tracking."""

@@ -19,6 +19,7 @@ from services.gateway.map_http import map_routes
 from services.gateway.members import Members
 from services.gateway.metrics import metrics_routes
 from services.gateway.owner import Fabric
+from services.gateway.path_renders.routes import path_render_routes
 from services.gateway.pose_http import pose_routes
 from services.gateway.problems import add_handlers
 from services.gateway.sessions import Sessions
@@ -61,6 +62,7 @@ def create_app(sessions: Sessions, authority: Authority) -> FastAPI:
         app.include_router(routes(sessions))
     app.include_router(pose_routes(sessions))
     app.include_router(geo_routes(sessions))
+    app.include_router(path_render_routes(sessions))
     app.include_router(ticket_routes(authority))
     app.include_router(metrics_routes())
     app.include_router(console_routes())

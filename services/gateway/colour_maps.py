@@ -23,8 +23,12 @@ class Picture:
     range_m: tuple[float, float] | None = None
 
 
-def picture(reply: RenderReply, layer: str) -> Picture:
+def picture(
+    reply: RenderReply, layer: str, depth_range_m: tuple[float, float] | None = None
+) -> Picture:
     """One layer of a render; black where nothing is drawn.
+
+    Without a range the colours of depth stand for what this render shows.
 
     Raises:
         InputError: there is no such layer.
@@ -34,15 +38,22 @@ def picture(reply: RenderReply, layer: str) -> Picture:
     if layer == "confidence":
         return Picture(_coloured(reply.confidence, cv2.COLORMAP_VIRIDIS, reply.alpha > 0))
     if layer == "depth":
-        return _depth(reply.depth_m)
+        return _depth(reply.depth_m, depth_range_m)
     raise InputError("layer", f"must be one of {', '.join(LAYERS)}, got {layer[:40]!r}")
 
 
-def _depth(depth_m: NDArray[np.float32]) -> Picture:
+def depth_range(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
+    """What the first and the last colour shall stand for, metres; None where nothing is drawn."""
     is_drawn = depth_m > 0
     if not is_drawn.any():
-        return Picture(np.zeros((*depth_m.shape, 3), np.uint8), (0.0, 0.0))
-    near, far = (float(bound) for bound in np.percentile(depth_m[is_drawn], _RANGE_PERCENT))
+        return None
+    near, far = np.percentile(depth_m[is_drawn], _RANGE_PERCENT)
+    return float(near), float(far)
+
+
+def _depth(depth_m: NDArray[np.float32], range_m: tuple[float, float] | None) -> Picture:
+    is_drawn = depth_m > 0
+    near, far = range_m or depth_range(depth_m) or (0.0, 0.0)
     share = (depth_m - near) / max(far - near, 1e-3)
     grey = np.rint(255.0 * (1.0 - share.clip(0.0, 1.0))).astype(np.uint8)  # near is warm
     return Picture(_coloured(grey, cv2.COLORMAP_TURBO, is_drawn), (near, far))

@@ -25,6 +25,9 @@ class LimitsConfig:
     max_connections: int = 512
     max_waiting_frames: int = 8  # of one offline session, beyond what its credits allow
     max_localizations: int = 8  # single images of one session that are searched for at a time
+    max_path_frames: int = 3600  # of one path render, two minutes of video
+    max_path_bytes: int = 1 << 30
+    max_path_renders: int = 4  # at a time, and so many more files are kept
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -34,6 +37,9 @@ class LimitsConfig:
             "max_connections",
             "max_waiting_frames",
             "max_localizations",
+            "max_path_frames",
+            "max_path_bytes",
+            "max_path_renders",
         )
 
 
@@ -137,4 +143,5 @@ class GatewayConfig:
     access: AccessConfig = field(default_factory=AccessConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     session_idle_s: float = 600.0  # a session that nobody uses for so long is forgotten here
+    path_keep_s: float = 600.0  # the file of a path render may be fetched for so long
     drain_s: float = 10.0  # time to finish what is in flight at SIGTERM

@@ -193,6 +193,30 @@ REFINE: dict[str, Any] = {
 }
 
 
+RENDER_PATH: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {"type": "object"},
+                "examples": {
+                    "past the keyframes": {"value": {"frames": 60, "width": 320}},
+                    "as it was walked": {
+                        "value": {"path": "trajectory", "frames": 60, "format": "mp4"}
+                    },
+                    "around what is in the middle": {
+                        "value": {"path": "orbit", "turn_deg": 30.0, "frames": 30}
+                    },
+                    "pictures of given views": {
+                        "value": {"path": "poses", "poses": [_POSE], "frames": 1, "format": "png"}
+                    },
+                },
+            }
+        },
+    },
+}
+
+
 def binary(*media_types: str) -> dict[int | str, dict[str, Any]]:
     """Responses of a route that answers bytes."""
     schema = {"schema": {"type": "string", "format": "binary"}}

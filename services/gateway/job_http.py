@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -14,6 +11,7 @@ from services.gateway import examples
 from services.gateway.config import GatewayConfig
 from services.gateway.decode import plain, read_json
 from services.gateway.events import EventKind
+from services.gateway.job_events import job_events
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
 from shared import codec
@@ -73,9 +71,7 @@ def _add_event_route(router: APIRouter, sessions: Sessions) -> None:
         first = await _refinement(session, config)
         if first.state is JobState.NONE:
             raise NotFoundError(f"session {session.name} was never refined")
-        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        events = _events(session, config, first)
-        return StreamingResponse(events, 200, headers, "text/event-stream")
+        return job_events(first, lambda: _refinement(session, config), config.stream)
 
 
 def _add_save_route(router: APIRouter, sessions: Sessions) -> None:
@@ -95,23 +91,3 @@ def _add_save_route(router: APIRouter, sessions: Sessions) -> None:
 async def _refinement(session: Session, config: GatewayConfig) -> JobStatus:
     timeout_s = config.mapping.question_timeout_s
     return await session.owner.ask("refinement", Empty(), JobStatus, timeout_s)
-
-
-async def _events(session: Session, config: GatewayConfig, job: JobStatus) -> AsyncIterator[str]:
-    """An event at each look that finds the job changed, a comment where nothing moves."""
-    interval_s, quiet_s = config.stream.event_interval_s, 0.0
-    yield _event(job)
-    while job.is_running:
-        await asyncio.sleep(interval_s)
-        before, job = job, await _refinement(session, config)
-        quiet_s = 0.0 if job != before else quiet_s + interval_s
-        if job != before:
-            yield _event(job)
-        elif quiet_s >= config.stream.ping_interval_s:
-            quiet_s = 0.0
-            yield ": nothing new\n\n"
-
-
-def _event(job: JobStatus) -> str:
-    name = "progress" if job.is_running else "end"
-    return f"event: {name}\ndata: {json.dumps(codec.to_json(job))}\n\n"

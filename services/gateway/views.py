@@ -64,7 +64,7 @@ class View:
         if self.format == "msgpack":
             return codec.pack(reply)
         if self.what == "depth":
-            return images.encode_png(_millimetres(reply.depth_m))
+            return images.encode_png(millimetres(reply.depth_m))
         if self.what != "colour":
             return images.encode_png(reply.alpha if self.what == "alpha" else reply.confidence)
         if self.format == "png":
@@ -77,7 +77,8 @@ def mean_confidence(reply: RenderReply) -> float:
     return float(reply.confidence.mean()) / 255.0 if reply.confidence.size else 0.0
 
 
-def _millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+def millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth as a PNG holds it; 0 where there is none."""
     return np.clip(np.rint(depth_m * DEPTH_SCALE), 0, 65534).astype(np.uint16)
 
 

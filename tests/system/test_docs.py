@@ -25,7 +25,7 @@ def commands(page: Path) -> list[list[str]]:
 
 def with_gateway(words: list[str], url: str, folder: Path) -> list[str]:
     """Name the gateway where the default is meant: of a session, not of a run's folder."""
-    is_session = words[1] == "export" and not (folder / words[2]).is_dir()
+    is_session = words[1] in ("export", "render-path") and not (folder / words[2]).is_dir()
     return [*words, "--gateway", url] if words[1] in TO_GATEWAY or is_session else words
 
 
