@@ -71,6 +71,8 @@ class OrbConfig:
     fast_threshold: int = 8
     num_levels: int = 8
     search_radius_px: float = 10.0
+    few_matches: int = 40  # fewer are looked for once more, in a wider circle
+    wide_radius_px: float = 30.0
     max_hamming_bits: int = 60
     ratio: float = 0.85
     max_hamming_bits_global: int = 64  # matching without a pose
@@ -122,6 +124,8 @@ class VerificationConfig:
     coarse_min_overlap: float = 0.08
     coarse_max_step_m: float = 0.3  # from the prediction
     coarse_max_step_deg: float = 15.0
+    explained_min_agreement: float = 0.95  # by geometry alone: no other start will do better
+    explained_min_overlap: float = 0.4
     max_step_m: float = 1.0
     max_step_deg: float = 50.0
 
@@ -140,6 +144,20 @@ class RelocalizationConfig:
     spread_cells: int = 8  # so many of 16 cells of the image: a repeated object fills fewer
     spread_inliers_colour: int = 80  # without depth to confirm them
     min_inlier_share_colour: float = 0.5
+
+
+@dataclass(frozen=True)
+class FeatureStartConfig:
+    """Where to start, from features with depth, while the camera moves in large steps."""
+
+    num_features: int = 500  # the best, whose descriptors are compared with all landmarks
+    num_samples: int = 300  # of three pairs: one in thirty is right where a third of pairs are
+    sample_px: float = 12.0  # depth of three points is that good
+    inlier_px: float = 5.0
+    min_inliers: int = 15
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "num_features", "num_samples", "sample_px", "inlier_px")
 
 
 @dataclass(frozen=True)
@@ -215,6 +233,7 @@ class TrackingConfig:
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    feature_start: FeatureStartConfig = field(default_factory=FeatureStartConfig)
     loop: LoopVerificationConfig = field(default_factory=LoopVerificationConfig)
     keyframe: KeyframeRuleConfig = field(default_factory=KeyframeRuleConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,8 @@ def _refine_until_still(
 ) -> _Refined:
     """Refine; where that moved the pose, find correspondences anew and repeat."""
     matches = _matches(observed, local, registration.T_world_camera, config)
+    if len(matches) < config.orb.few_matches:
+        registration, matches = _drawn_by_features(observed, local, registration, matches, config)
     refinement = _refine(observed, local, registration, matches, config)
     for _ in range(config.refinement.max_relinearisations - 1):
         T = refinement.T_world_camera
@@ -126,6 +128,28 @@ def _refine_until_still(
 def _is_within(step: NDArray[np.float64], metres: float, radians: float) -> bool:
     """Whether what corresponds would stay the same after this step."""
     return float(np.linalg.norm(step[:3, 3])) < metres and angle_rad(step) < radians
+
+
+def _drawn_by_features(
+    observed: Observed,
+    local: LocalMap,
+    registration: Registration,
+    matches: Matches,
+    config: TrackingConfig,
+) -> tuple[Registration, Matches]:
+    """Where matches of a wider search draw the pose, if more features match there than did here.
+
+    ORB-SLAM widens its search likewise: what geometry leaves open may be off by many pixels.
+    """
+    orb = replace(config.orb, search_radius_px=config.orb.wide_radius_px)
+    T = registration.T_world_camera
+    wide = _matches(observed, local, T, replace(config, orb=orb))
+    T_drawn = _refine(observed, local, registration, wide, config).T_world_camera
+    drawn = _matches(observed, local, T_drawn, config)
+    if len(drawn) <= len(matches):
+        return registration, matches
+    level = local.voxels.levels[-1]
+    return linearise(observed.cloud, level, T_drawn, config.registration), drawn
 
 
 def _matches(

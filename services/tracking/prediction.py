@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.tracking.config import VerificationConfig
+from services.tracking.verification import Step, step_between
 from shared.frames import Frame, Prior
 from shared.se3 import exp, inverse, log
 from shared.tracks import TrackingContext
@@ -32,6 +34,17 @@ def predict(prior: Prior, frame: Frame) -> NDArray[np.float64]:
     return prior.T_world_camera @ _constant_velocity(prior, frame)
 
 
+def is_predictable(prior: Prior, frame: Frame, config: VerificationConfig) -> bool:
+    """Whether a frame is expected about where it will be: by odometry, or after a small step."""
+    if prior.frame_digest == frame.digest():
+        return True
+    if prior.T_odom_camera is not None and frame.T_odom_camera is not None:
+        return True
+    expected = step_between(np.eye(4), _constant_velocity(prior, frame))
+    near = Step(config.near_step_m, config.near_step_deg)
+    return _has_velocity(prior, frame) and expected.is_within(near)
+
+
 def turned_starts(
     T_world_camera: NDArray[np.float64], turn_deg: float
 ) -> list[NDArray[np.float64]]:
@@ -45,9 +58,14 @@ def turned_starts(
 
 def _constant_velocity(prior: Prior, frame: Frame) -> NDArray[np.float64]:
     """T_last_now, if the last motion goes on; nothing where it is too old to go by."""
-    if prior.before_last_dt_ns <= 0 or prior.lost_frames > 0:
+    if not _has_velocity(prior, frame):
         return np.eye(4)
     ratio = (frame.t_ns - prior.t_ns) / prior.before_last_dt_ns
-    if not 0.0 < ratio <= _MAX_EXTRAPOLATION:
-        return np.eye(4)
     return exp(ratio * log(prior.T_before_last))
+
+
+def _has_velocity(prior: Prior, frame: Frame) -> bool:
+    """Whether the last motion is known and recent."""
+    if prior.before_last_dt_ns <= 0 or prior.lost_frames > 0:
+        return False
+    return 0.0 < (frame.t_ns - prior.t_ns) / prior.before_last_dt_ns <= _MAX_EXTRAPOLATION

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.tracking.absolute_orientation import locate_by_points
 from services.tracking.config import TrackingConfig, VerificationConfig
 from services.tracking.estimate import Estimate, attempt, pose_covariance
 from services.tracking.keyframes import is_well_known
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.observed import Observed
-from services.tracking.prediction import predict, turned_starts
+from services.tracking.prediction import is_predictable, predict, turned_starts
 from services.tracking.relocalization import Recovery, is_found, locate, recover
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Step, is_possible_step, step_between
-from shared.frames import TrackingStatus, TrackRequest
+from shared.frames import Prior, TrackingStatus, TrackRequest
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,18 @@ class Job:
                 self.observed.intrinsics,
                 self.config.orb,
                 self.config.relocalization,
+            )
+
+    def locate_nearby(self, local: LocalMap) -> NDArray[np.float64] | None:
+        """Pose from features with depth: sooner than `locate`, and good enough to start from."""
+        with self.clock.stage("wait"):
+            self.observed.wait()
+        with self.clock.stage("feature_start"):
+            return locate_by_points(
+                self.observed.features,
+                local.context.landmarks,
+                self.observed.intrinsics,
+                self.config,
             )
 
 
@@ -86,28 +100,58 @@ def _best_nearby(job: Job, local: LocalMap) -> Estimate | None:
     if prior is None:
         return None
     predicted = predict(prior, job.request.frame)
-    first = job.attempt(local, predicted)
-    config = job.config.verification
-    if is_sure(first, config) or is_as_predicted(first, predicted, config):
-        return first
-    if is_only_seen(first, config):
-        return first
-    starts = [job.locate(local), prior.T_world_camera.copy()]
-    best = _best([first, *(job.attempt(local, T) for T in starts if T is not None)])
-    if prior.lost_frames > 0 or not _is_doubtful(best, predicted, config):
+    tried: list[Estimate] = []
+    for T_start in _starts(job, local, prior, predicted):
+        tried.append(job.attempt(local, T_start))
+        if _is_enough(job, tried[-1], predicted):
+            return tried[-1]
+    best = _best(tried)
+    if prior.lost_frames > 0 or not _is_doubtful(best, predicted, job.config.verification):
         return best
     turned = turned_starts(predicted, job.config.registration.turn_deg)
     return _best([best, *(job.attempt(local, T) for T in turned)])
 
 
+def _starts(
+    job: Job, local: LocalMap, prior: Prior, T_predicted: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """As predicted, where features say, where it was; in large steps features come first."""
+    is_near = is_predictable(prior, job.request.frame, job.config.verification)
+    T_located = None if is_near else job.locate_nearby(local)
+    if T_located is not None:
+        yield T_located
+    yield T_predicted
+    if T_located is None and (T_located := job.locate(local)) is not None:
+        yield T_located
+    yield prior.T_world_camera.copy()
+
+
+def _is_enough(job: Job, estimate: Estimate, T_predicted: NDArray[np.float64]) -> bool:
+    """Nothing else needs to be tried."""
+    config = job.config.verification
+    return (
+        is_found(job.observed, estimate, job.config)
+        or is_as_predicted(estimate, T_predicted, config)
+        or is_only_seen(estimate, config)
+    )
+
+
 def _is_doubtful(
     estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
 ) -> bool:
-    """Not confirmed, and not where it was expected either, though there is depth to find it by."""
+    """Not confirmed, not where it was expected, and depth does not fit the map all over.
+
+    What geometry leaves open stays at the start: a turned start that fits no better spoils it.
+    """
     near = Step(config.near_step_m, config.near_step_deg)
     is_near = step_between(T_predicted, estimate.T_world_camera).is_within(near)
     is_expected = is_near and is_coarse(estimate, T_predicted, config)
-    return not (is_confirmed(estimate, config) or is_expected or estimate.agreement.is_silent)
+    is_explained = (
+        estimate.agreement.share >= config.explained_min_agreement
+        and estimate.registration.overlap >= config.explained_min_overlap
+    )
+    is_settled = is_confirmed(estimate, config) or is_expected or is_explained
+    return not (is_settled or estimate.agreement.is_silent)
 
 
 def _best(estimates: list[Estimate]) -> Estimate:

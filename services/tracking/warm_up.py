@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,7 @@ from shared.frames import (
     TrackRequest,
 )
 from shared.rectify import register_depth
+from shared.se3 import exp
 from shared.tracks import (
     Candidate,
     Candidates,
@@ -47,6 +50,8 @@ def warm_up(config: TrackingConfig) -> None:
     near = track(_request(10, 0.05, _prior(0.04)), source, config)
     assert near.keyframe is not None
     track(_request(11, 0.1, None), source, config)
+    after_a_step = replace(_prior(0.04), T_before_last=exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    track(_request(12, 0.1, after_a_step), source, config)
     register_depth(np.ones((120, 160), np.float32), _CAMERA, _CAMERA, np.eye(4))
 
 
