@@ -1,7 +1,5 @@
-"""Participants on the real bus that answer with plain values, and a gateway process before them.
-
-They let the gateway be measured and tested by itself: a tracker that takes a given time, a mapper
-that keeps records in memory.
+"""Participants on the real bus that answer with plain values: a tracker that takes a given time, a
+mapper that keeps records in memory. They let the gateway be measured and tested by itself.
 """
 
 from __future__ import annotations
@@ -84,7 +82,8 @@ class StandInTracker:
         time.sleep(self.delay_s)
         frame, prior = request.frame, request.prior
         reference = prior.newest_keyframe_seq if prior else frame.seq
-        is_keyframe = prior is None or frame.seq - reference >= KEYFRAME_EVERY
+        is_due = prior is None or frame.seq - reference >= KEYFRAME_EVERY
+        is_keyframe = is_due and frame.may_be_keyframe and self.status in HAS_POSE
         T_world_camera = request.T_world_first @ se3.exp([STEP_M * frame.seq, 0, 0, 0, 0, 0])
         T_world_reference = request.T_world_first @ se3.exp([STEP_M * reference, 0, 0, 0, 0, 0])
         return TrackResult(
@@ -99,7 +98,7 @@ class StandInTracker:
             inlier_share=0.5,
             map_revision=request.map_revision,
             timings_ms={"decode": 1.0},
-            keyframe=empty_keyframe() if is_keyframe and self.status in HAS_POSE else None,
+            keyframe=empty_keyframe() if is_keyframe else None,
         )
 
     def localize(self, request: LocalizeRequest) -> LocalizeResult:

@@ -38,6 +38,11 @@ def add_client(parser: argparse.ArgumentParser) -> None:
             kind.add_argument("--intrinsics", metavar="FX,FY,CX,CY,WIDTH,HEIGHT")
         else:
             kind.add_argument("--record", type=Path, metavar="FILE.mcap")
+            kind.add_argument(
+                "--watch",
+                action="store_true",
+                help="be found in the map of --session and followed; nothing of it changes",
+            )
 
 
 def _client(arguments: argparse.Namespace) -> None:
@@ -48,7 +53,10 @@ def _client(arguments: argparse.Namespace) -> None:
         sys.stdout.flush()
 
     record = getattr(arguments, "record", None)
-    request = StreamRequest(arguments.gateway, arguments.session, record)
+    watches = getattr(arguments, "watch", False)
+    if watches and arguments.session is None:
+        raise ConfigError("--watch needs --session")
+    request = StreamRequest(arguments.gateway, arguments.session, record, watches)
     if arguments.kind == "video":
         localize_video(arguments.path, _intrinsics(arguments.intrinsics), request, say)
     else:

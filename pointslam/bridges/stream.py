@@ -16,6 +16,7 @@ from shared.camera import Camera, Intrinsics
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, DepthImage
 from shared.images import encode_depth, encode_jpeg
 from shared.localization import LocalizeReply
+from shared.se3 import Pose
 from shared.stream import FrameMessage, FrameReply
 
 Say = Callable[[str], None]
@@ -26,12 +27,14 @@ _SAY_EVERY_S = 1.0
 class StreamRequest:
     """Where a source goes. A session of that name is gone on with; without one a new one is made.
 
-    `record`: an MCAP file that gets every frame that is sent.
+    `record`: an MCAP file that gets every frame that is sent. `watches`: the session is only
+    watched: its map does not change.
     """
 
     gateway: str
     session: str | None = None
     record: Path | None = None
+    watches: bool = False
 
 
 def stream_source(source: Source, request: StreamRequest, say: Say) -> str:
@@ -44,18 +47,27 @@ def stream_source(source: Source, request: StreamRequest, say: Say) -> str:
         PointSlamError: the gateway refused the session or a frame, or the connection broke.
     """
     with Client(request.gateway) as client:
-        session = _session(client, source, request.session)
+        session = _session(client, source, request)
         say(f"session {session.name} at {request.gateway}")
+        frames = _messages(session, source, request.record)
         try:
-            next_s = 0.0
-            for reply in session.stream(_messages(session, source, request.record)):
-                if reply.error is not None or time.monotonic() >= next_s:
-                    say(_line(reply))
-                    next_s = time.monotonic() + _SAY_EVERY_S
+            if request.watches:
+                _say_replies(session.watch(frames, source.calibration), say)
+            else:
+                _say_replies(session.stream(frames), say)
         finally:
             source.close()
-            session.save()
+            if not request.watches:
+                session.save()
     return session.name
+
+
+def _say_replies(replies: Iterator[FrameReply], say: Say) -> None:
+    next_s = 0.0
+    for reply in replies:
+        if reply.error is not None or time.monotonic() >= next_s:
+            say(_line(reply))
+            next_s = time.monotonic() + _SAY_EVERY_S
 
 
 def localize_video(
@@ -82,7 +94,10 @@ def localize_video(
     return replies
 
 
-def _session(client: Client, source: Source, name: str | None) -> Session:
+def _session(client: Client, source: Source, request: StreamRequest) -> Session:
+    name = request.session
+    if request.watches:
+        return client.session(name or "")
     exists = name is not None and name in {found["session"] for found in client.sessions()}
     if exists and name is not None:
         return client.session(name)
@@ -112,11 +127,15 @@ def _encoded(frame: CameraFrame) -> SequenceFrame:
 def _line(reply: FrameReply) -> str:
     if reply.error is not None:
         return f"{reply.seq}: {reply.error.field}: {reply.error.reason}"
-    return f"{reply.seq}: {reply.status}"
+    return f"{reply.seq}: {reply.status}{_position(reply.T_map_camera)}"
 
 
 def _place(reply: LocalizeReply) -> str:
-    if reply.T_map_camera is None:
-        return f" ({reply.reason})"
-    p = reply.T_map_camera.position
+    return _position(reply.T_map_camera) or f" ({reply.reason})"
+
+
+def _position(pose: Pose | None) -> str:
+    if pose is None:
+        return ""
+    p = pose.position
     return f" at {p.x:.3f} {p.y:.3f} {p.z:.3f} m"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterable, AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator
+from contextlib import AsyncExitStack, aclosing, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from pointslam.client import calls, path_render, refinement
-from pointslam.client.frame_stream import refusal
+from pointslam.client.frame_stream import StreamTarget, refusal
 from pointslam.client.messages import FrameOptions, frame_message, localize_message
 from pointslam.client.progress import POLL_S, Progress, pending
 from shared import codec
@@ -67,9 +67,26 @@ class AsyncSession:
 
     async def stream(self, frames: AsyncIterable[FrameMessage]) -> AsyncIterator[FrameReply]:
         """Send frames over a WebSocket and yield their replies in order; see `Session.stream`."""
-        async with _open(
-            calls.stream_url(self._client.url, self.name), self._client.headers
-        ) as connection:
+        target = StreamTarget(calls.stream_url(self._client.url, self.name), self._client.headers)
+        async with aclosing(self._replies(target, frames)) as replies:
+            async for reply in replies:
+                self.next_seq = max(self.next_seq, reply.seq + 1)
+                yield reply
+
+    async def watch(
+        self, frames: AsyncIterable[FrameMessage], device: Calibration | None = None
+    ) -> AsyncIterator[FrameReply]:
+        """Follow a camera in this session's map, which does not change; see `Session.watch`."""
+        url = calls.watch_url(self._client.url, self.name)
+        target = StreamTarget(url, self._client.headers, calls.device_text(device))
+        async with aclosing(self._replies(target, frames)) as replies:
+            async for reply in replies:
+                yield reply
+
+    async def _replies(
+        self, target: StreamTarget, frames: AsyncIterable[FrameMessage]
+    ) -> AsyncGenerator[FrameReply, None]:
+        async with _open(target) as connection:
             credit = asyncio.Semaphore(self._credit) if self.mode == "offline" else None
             sent: asyncio.Queue[bool] = asyncio.Queue()
             sender = asyncio.create_task(_send_all(connection, frames, credit, sent))
@@ -78,7 +95,6 @@ class AsyncSession:
                     reply = codec.unpack(FrameReply, await _receive(connection))
                     if credit is not None:
                         credit.release()
-                    self.next_seq = max(self.next_seq, reply.seq + 1)
                     yield reply
                 await sender
             finally:
@@ -213,12 +229,15 @@ async def _send_all(
 
 
 @asynccontextmanager
-async def _open(url: str, headers: dict[str, str]) -> AsyncIterator[ClientConnection]:
+async def _open(target: StreamTarget) -> AsyncIterator[ClientConnection]:
+    url, headers = target.url, target.headers
     async with AsyncExitStack() as stack:
         try:
             connection = await stack.enter_async_context(
                 connect(url, additional_headers=headers, compression=None, ping_timeout=120)
             )
+            if target.greeting is not None:
+                await connection.send(target.greeting)
         except InvalidStatus as error:
             raise calls.error_from(refusal(error)) from None
         except (OSError, TimeoutError) as error:

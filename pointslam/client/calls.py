@@ -5,6 +5,7 @@ The synchronous and the asynchronous client differ only in who sends it.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -275,4 +276,18 @@ def export_path(session: str) -> str:
 
 def stream_url(url: str, session: str) -> str:
     """The WebSocket of a session's frames."""
-    return "ws" + url.removeprefix("http").rstrip("/") + path_of(session, "/stream")
+    return _socket_url(url, session, "/stream")
+
+
+def watch_url(url: str, session: str) -> str:
+    """The WebSocket of the frames of one who watches a session."""
+    return _socket_url(url, session, "/watch")
+
+
+def device_text(device: Calibration | None) -> str | None:
+    """What a watcher says before its frames; nothing where it has the session's device."""
+    return None if device is None else json.dumps({"calibration": codec.to_json(device)})
+
+
+def _socket_url(url: str, session: str, rest: str) -> str:
+    return "ws" + url.removeprefix("http").rstrip("/") + path_of(session, rest)

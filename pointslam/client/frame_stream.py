@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 
 import httpx
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -18,11 +19,17 @@ from shared.stream import ErrorDetail, FrameMessage, FrameReply
 _MAX_REPLY_BYTES = 1 << 20
 
 
+@dataclass(frozen=True)
+class StreamTarget:
+    """Where frames go: a socket, its headers, and what it is told before the first frame."""
+
+    url: str
+    headers: Mapping[str, str] = field(default_factory=dict)
+    greeting: str | None = None
+
+
 def stream_frames(
-    url: str,
-    frames: Iterable[FrameMessage],
-    credit: int | None,
-    headers: Mapping[str, str] | None = None,
+    target: StreamTarget, frames: Iterable[FrameMessage], credit: int | None
 ) -> Iterator[FrameReply]:
     """Send frames and yield replies; without credit each frame is sent as soon as it is there.
 
@@ -30,7 +37,9 @@ def stream_frames(
         PointSlamError: the gateway refused the stream, or the connection broke.
         Exception: what `frames` raised.
     """
-    with open_stream(url, headers) as connection:
+    with open_stream(target.url, target.headers) as connection:
+        if target.greeting is not None:
+            connection.send(target.greeting)
         sender = _Sender(connection, frames, credit)
         sender.start()
         try:

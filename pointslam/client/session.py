@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pointslam.client import calls, path_render, refinement
-from pointslam.client.frame_stream import stream_frames
+from pointslam.client.frame_stream import StreamTarget, stream_frames
 from pointslam.client.messages import FrameOptions, frame_message, localize_message
 from pointslam.client.progress import POLL_S, Progress, pending
 from pointslam.client.resuming import Route, resuming
@@ -94,8 +94,31 @@ class Session:
 
     def _stream_here(self, frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
         url = calls.stream_url(self._client.url, self.name)
-        credit = self._credit if self.mode == "offline" else None
-        return stream_frames(url, frames, credit, self._client.headers)
+        return stream_frames(StreamTarget(url, self._client.headers), frames, self._under_way)
+
+    def watch(
+        self, frames: Iterable[FrameMessage], device: Calibration | None = None
+    ) -> Iterator[FrameReply]:
+        """Follow a camera in this session's map, whoever else streams; the map does not change.
+
+        Replies say LOST, without a pose, until the camera is found. Numbers and times need only
+        grow within this stream. As in `stream`, a live session's replies may say SUPERSEDED.
+
+        Args:
+            frames: made by `frame`, or by any other means.
+            device: what takes the images, where it is not the session's device.
+
+        Raises:
+            UnavailableError: the connection broke; a new one must find the camera again.
+        """
+        url = calls.watch_url(self._client.url, self.name)
+        target = StreamTarget(url, self._client.headers, calls.device_text(device))
+        return stream_frames(target, frames, self._under_way)
+
+    @property
+    def _under_way(self) -> int | None:
+        """How many frames may be sent before their replies come; None: any number."""
+        return self._credit if self.mode == "offline" else None
 
     def localize(
         self,

@@ -56,10 +56,11 @@ class _Seat:
 
 @dataclass(frozen=True)
 class Limits:
-    """How long one question may take, seconds."""
+    """How long one question may take, seconds, and whose it is."""
 
     timeout_s: float  # of one worker
     wait_s: float  # for a worker to be there
+    seat: str  # who sticks to one worker: a session, or one that watches it
     patience_s: float = math.inf  # then another worker is asked beside
 
 
@@ -99,7 +100,7 @@ class TrackerPool:
         kind: type,
         limits: Limits,
     ) -> Any:
-        session, failed = request.session, set[str]()
+        session, failed = limits.seat, set[str]()
         deadline = time.monotonic() + limits.wait_s
         race: Race[Any] = Race()
         try:

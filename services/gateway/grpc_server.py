@@ -19,8 +19,8 @@ from services.gateway.grpc_services import (
     MapService,
     PoseService,
     SessionService,
-    TrackingService,
 )
+from services.gateway.grpc_tracking import TrackingService
 from services.gateway.sessions import Sessions
 from shared.errors import UnavailableError
 from shared.wire import (

@@ -1,19 +1,12 @@
-"""The gRPC services of pointslam.v1, on the same sessions as HTTP."""
+"""The gRPC services of sessions, poses and maps, on the same sessions as HTTP."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from dataclasses import replace
 from typing import Any
 
-import grpc
-
-from services.gateway.access.caller import current_caller
-from services.gateway.decode import UNKNOWN, check_frame
-from services.gateway.frame_stream import FrameStream, SlowClientError
 from services.gateway.grpc_errors import refusing
-from services.gateway.localizer import check_localize
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.pose_watch import correction, follow, watched
 from services.gateway.session import Session
@@ -22,19 +15,13 @@ from services.gateway.views import View, mean_confidence
 from services.gateway.wire_values import (
     calibration_from,
     chosen,
-    frame_from,
     intrinsics_from,
-    localize_from,
-    localized_to,
     matrix_from,
     pose_from,
-    reply_to,
     require,
     timed_pose_to,
 )
-from shared.errors import InputError
 from shared.maps import ExportFormat, RenderRequest
-from shared.stream import FrameMessage, FrameReply
 from shared.wire import (
     map_service_pb2,
     map_service_pb2_grpc,
@@ -42,7 +29,6 @@ from shared.wire import (
     pose_service_pb2_grpc,
     session_service_pb2,
     session_service_pb2_grpc,
-    tracking_service_pb2_grpc,
     types_pb2,
 )
 
@@ -139,67 +125,6 @@ class SessionService(session_service_pb2_grpc.SessionServiceServicer):
             last_t_ns=tracking["last_t_ns"],
             credit=tracking["credit"],
         )
-
-
-class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
-    """Frames in, poses out."""
-
-    def __init__(self, sessions: Sessions) -> None:
-        self._sessions = sessions
-
-    async def TrackFrames(self, request_iterator: Any, context: Any) -> None:
-        """Answer a stream of frames in order."""
-        async with refusing(context):
-            requests = aiter(request_iterator)
-            try:
-                first = await anext(requests)
-            except StopAsyncIteration:
-                return
-            session = await self._sessions.get(first.session_id)
-
-            traceparent = dict(context.invocation_metadata()).get("traceparent", "")
-
-            async def read(frames: FrameStream) -> None:
-                await frames.put(
-                    lambda: _frame(first, session, traceparent), lambda: _numbers(first)
-                )
-                async for request in requests:
-                    await frames.put(
-                        lambda request=request: _frame(request, session, traceparent),
-                        lambda request=request: _numbers(request),
-                    )
-
-            async def send(reply: FrameReply) -> None:
-                await context.write(reply_to(reply))
-
-            stream = FrameStream(session, self._sessions.fabric.config.stream, send)
-            try:
-                await stream.run(read)
-            except SlowClientError:
-                await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "replies are not read")
-
-    async def Localize(self, request: Any, context: Any) -> Any:
-        """Find one image in a session's map."""
-        async with refusing(context):
-            session = await self._sessions.get(request.session_id)
-            message = localize_from(request)
-            check_localize(message, session.calibration)
-            return localized_to(await session.localize(message))
-
-
-def _frame(request: Any, session: Session, traceparent: str) -> FrameMessage:
-    current_caller().budget.take_frame()
-    if request.session_id not in ("", session.name):
-        raise InputError("session_id", f"this stream is of session {session.name}")
-    message = replace(frame_from(require(request, "frame")), traceparent=traceparent)
-    check_frame(message, session.calibration)
-    return message
-
-
-def _numbers(request: Any) -> tuple[int, int]:
-    if not request.HasField("frame"):
-        return UNKNOWN, UNKNOWN
-    return request.frame.seq, request.frame.t_ns
 
 
 class PoseService(pose_service_pb2_grpc.PoseServiceServicer):

@@ -117,7 +117,7 @@ class Localizer:
 
     async def _ask(self, message: LocalizeMessage, map_revision: int) -> LocalizeResult:
         times = self._fabric.config.dispatch
-        limits = Limits(times.offline_timeout_s, times.offline_wait_s)
+        limits = Limits(times.offline_timeout_s, times.offline_wait_s, self._owner.session)
 
         async def ask() -> LocalizeResult:
             request = self._request(message, map_revision)

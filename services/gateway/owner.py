@@ -27,7 +27,15 @@ from shared.errors import (
     UnavailableError,
 )
 from shared.maps import Empty
-from shared.tracks import Advance, AdvanceReply, KeyframePoses, OpenReply, OpenRequest
+from shared.tracks import (
+    Advance,
+    AdvanceReply,
+    ClaimReply,
+    ClaimRequest,
+    KeyframePoses,
+    OpenReply,
+    OpenRequest,
+)
 
 LOGGER = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -81,6 +89,15 @@ class MapOwner:
         reply = await self.ask("advance", entry, AdvanceReply, self._config.advance_timeout_s)
         self.acknowledged_revision = max(self.acknowledged_revision, reply.map_revision)
         self.logged_seq = max(self.logged_seq, reply.acknowledged_seq)
+
+    async def claim(self, held: int) -> ClaimReply:
+        """Ask to be who advances the session; `held` is the number of our claim, 0 without one.
+
+        Raises:
+            UnavailableError: the map has no owner who could say so.
+        """
+        request = ClaimRequest(self._fabric.name, held)
+        return await self.ask("claim", request, ClaimReply, self._config.question_timeout_s)
 
     async def ask(self, question: str, message: object, kind: type, timeout_s: float) -> Any:
         """Ask the owner; when it is gone, open the session on a live mapper and ask again.

@@ -11,7 +11,6 @@ from typing import Any
 
 from services.gateway.access.tenants import public_name
 from services.gateway.delivery import Delivery
-from services.gateway.dispatch import Limits
 from services.gateway.errors import detail
 from services.gateway.frame_queue import FrameQueue, Outcome
 from services.gateway.frame_reply import reply_of
@@ -21,21 +20,16 @@ from services.gateway.owner import Fabric, MapOwner
 from services.gateway.pose_feed import PoseFeed
 from services.gateway.poses import TimedPose, record_of
 from services.gateway.prior import next_prior, resumed_prior
+from services.gateway.tracker_question import TrackerQuestion
 from services.gateway.usage import Usage
+from services.gateway.watcher import Watchers
 from shared.bus import Keys
 from shared.errors import ClaimLostError, PointSlamError, UnavailableError
 from shared.frames import Frame, Prior, TrackRequest
 from shared.localization import LocalizeMessage, LocalizeReply
 from shared.stream import FrameMessage, FrameReply
 from shared.tracing import log_fields, span
-from shared.tracks import (
-    Advance,
-    Advanced,
-    ClaimReply,
-    ClaimRequest,
-    OpenReply,
-    TrackResult,
-)
+from shared.tracks import Advance, Advanced, OpenReply
 
 LOGGER = logging.getLogger(__name__)
 
@@ -56,10 +50,13 @@ class Session:
         self.poses = PoseFeed(fabric.config.stream)
         room = fabric.config.limits.max_waiting_frames
         self._frames = FrameQueue(self._answer, self.is_live, room)
+        self._question = TrackerQuestion(fabric, self.owner, self.is_live, opened.session)
         self._localizer = Localizer(fabric, self.owner, self.calibration)
+        self.watchers = Watchers(fabric, self.owner, opened)
         self.usage = Usage()
         self._claim = 0  # the number of ours; 0 while another gateway may advance the session
         self._claiming = asyncio.Lock()
+        self._stream: object = None  # the newest
         self._take_up(opened)
         self._unfollow = self._follow_owner()
 
@@ -75,7 +72,7 @@ class Session:
             wait_s = self._fabric.config.mapping.claim_wait_s if self._claim else None
             try:
                 async with asyncio.timeout(wait_s):
-                    reply = await self._ask_claim()
+                    reply = await self.owner.claim(self._claim)
             except (TimeoutError, UnavailableError):
                 if self._claim == 0:
                     raise
@@ -85,11 +82,6 @@ class Session:
                 self.owner.take(reply.opened)
                 self._take_up(reply.opened)
             self._claim = reply.number
-
-    async def _ask_claim(self) -> ClaimReply:
-        request = ClaimRequest(self._fabric.name, self._claim)
-        timeout_s = self._fabric.config.mapping.question_timeout_s
-        return await self.owner.ask("claim", request, ClaimReply, timeout_s)
 
     def is_idle(self, idle_s: float) -> bool:
         """Whether nobody has used it for so long, and nothing is under way."""
@@ -106,9 +98,20 @@ class Session:
         """Since when its oldest unanswered frame waits or is under way."""
         return self._frames.age_s
 
-    def submit(self, message: FrameMessage) -> asyncio.Future[Outcome]:
-        """Queue a checked frame; raises as `FrameQueue.submit`, ClaimLostError where it is lost."""
+    async def begin_stream(self, stream: object) -> None:
+        """Let one stream, and no older one, submit frames; raises as `claim`."""
+        await self.claim()
+        self._stream = stream
+
+    def submit(self, message: FrameMessage, stream: object = None) -> asyncio.Future[Outcome]:
+        """Queue a checked frame, of a stream or by itself; raises as `FrameQueue.submit`.
+
+        Raises:
+            ClaimLostError: a newer stream or another gateway advances the session.
+        """
         self._require_claim()
+        if stream not in (None, self._stream):
+            raise _claim_lost(self.name)
         self.usage.touch()
         return self._frames.submit(message)
 
@@ -171,6 +174,7 @@ class Session:
             "lost_frames": prior.lost_frames if prior else 0,
             "newest_keyframe_seq": prior.newest_keyframe_seq if prior else -1,
             "undelivered": self.undelivered,
+            "watchers": len(self.watchers),
         }
 
     async def flush(self, timeout_s: float) -> bool:
@@ -181,6 +185,7 @@ class Session:
     def close(self) -> None:
         """Stop serving; the map stays with its owner."""
         self._frames.refuse(UnavailableError("the session was closed"))
+        self.watchers.close()
         self._delivery.give_up()
         self._unfollow()
         self.owner.close()
@@ -198,7 +203,7 @@ class Session:
         self._require_claim()
         start = time.perf_counter()
         frame = message.frame()
-        result = await self._ask_tracker(frame)
+        result = await self._question.ask(lambda: self._request(frame))
         prior = next_prior(self._prior, frame, result)
         entry = Advance(
             record_of(result),
@@ -252,17 +257,6 @@ class Session:
         if self._claim == 0:
             raise _claim_lost(self.name)
 
-    async def _ask_tracker(self, frame: Frame) -> TrackResult:
-        dispatch = self._fabric.config.dispatch
-        limits = Limits(dispatch.offline_timeout_s, dispatch.offline_wait_s)
-        if self.is_live:
-            limits = Limits(dispatch.live_timeout_s, dispatch.live_wait_s)
-
-        async def ask() -> TrackResult:
-            return await self._fabric.trackers.track(self._request(frame), limits)
-
-        return await self.owner.ask_tracker(ask, limits.wait_s)
-
     def _request(self, frame: Frame) -> TrackRequest:
         if self._delivery.holds_keyframe:
             # It would cover what a keyframe that trackers cannot see yet covers already.
@@ -296,4 +290,4 @@ class Session:
 
 
 def _claim_lost(session: str) -> ClaimLostError:
-    return ClaimLostError(f"another gateway advances session {session}: go on there, or reconnect")
+    return ClaimLostError(f"another client advances session {session}: reconnect, or watch it")

@@ -53,12 +53,16 @@ class ContextCache:
                 self._maps.move_to_end(key)
             return self._maps.get(key)
 
-    def newest(self, session: str) -> LocalMap | None:
-        """The most recently used map of a session, of what is near to a keyframe in any way."""
+    def newest(self, session: str, reference_seq: int) -> LocalMap | None:
+        """The most recently used map of a session, of what is near to a keyframe in any way.
+
+        If it can be, one that shows the keyframe: several cameras may be in one map.
+        """
         with self._lock:
-            of_session = (k for k in reversed(self._maps) if k[0] == session and not k[4])
-            key = next(of_session, None)
-            return None if key is None else self._maps[key]
+            keys = [k for k in reversed(self._maps) if k[0] == session and not k[4]]
+            maps = [self._maps[key] for key in keys]
+        shown = (local for local in maps if _shows(local, reference_seq))
+        return next(shown, maps[0] if maps else None)
 
     def put(self, key: ContextKey, local: LocalMap) -> None:
         """Keep a map; the least recently used one leaves when there are too many."""
@@ -67,6 +71,12 @@ class ContextCache:
             self._maps.move_to_end(key)
             while len(self._maps) > self._limit:
                 self._maps.popitem(last=False)
+
+
+def _shows(local: LocalMap, seq: int) -> bool:
+    """Whether a keyframe is one of a neighbourhood's."""
+    context = local.context
+    return seq == context.reference_seq or seq in (keyframe.seq for keyframe in context.window)
 
 
 class BusSource:
@@ -117,8 +127,12 @@ class BusSource:
             return older  # what comes late is there for the next frame
 
     def _older_map(self) -> LocalMap | None:
-        is_accepted = isinstance(self._request, TrackRequest) and self._request.accepts_older_map
-        return self._cache.newest(self._request.session) if is_accepted else None
+        request = self._request
+        if not (isinstance(request, TrackRequest) and request.accepts_older_map):
+            return None
+        return self._cache.newest(
+            request.session, request.prior.reference_seq if request.prior else -1
+        )
 
     def loop_map(self, seq: int) -> LocalMap:
         """The neighbourhood of a keyframe, of what is near to it in the graph only."""

@@ -130,6 +130,22 @@ class TrackFramesResponse(_message.Message):
     map_problem: _types_pb2.ErrorDetail
     def __init__(self, seq: _Optional[int] = ..., t_ns: _Optional[int] = ..., status: _Optional[_Union[_types_pb2.TrackingStatus, str]] = ..., T_map_camera: _Optional[_Union[_types_pb2.Pose, _Mapping]] = ..., pos_std_m: _Optional[float] = ..., rot_std_deg: _Optional[float] = ..., inliers: _Optional[int] = ..., inlier_share: _Optional[float] = ..., reference_seq: _Optional[int] = ..., map_revision: _Optional[int] = ..., keyframe: _Optional[bool] = ..., timings_ms: _Optional[_Mapping[str, float]] = ..., credit: _Optional[int] = ..., error: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ..., map_problem: _Optional[_Union[_types_pb2.ErrorDetail, _Mapping]] = ...) -> None: ...
 
+class WatchFramesRequest(_message.Message):
+    __slots__ = ("session_id", "frame", "calibration")
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    frame: Frame
+    calibration: _types_pb2.Calibration
+    def __init__(self, session_id: _Optional[str] = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., calibration: _Optional[_Union[_types_pb2.Calibration, _Mapping]] = ...) -> None: ...
+
+class WatchFramesResponse(_message.Message):
+    __slots__ = ("reply",)
+    REPLY_FIELD_NUMBER: _ClassVar[int]
+    reply: TrackFramesResponse
+    def __init__(self, reply: _Optional[_Union[TrackFramesResponse, _Mapping]] = ...) -> None: ...
+
 class LocalizeRequest(_message.Message):
     __slots__ = ("session_id", "rgb", "depth", "T_map_camera_prior", "calibration", "camera")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]

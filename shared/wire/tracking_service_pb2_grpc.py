@@ -40,6 +40,11 @@ class TrackingServiceStub:
                 request_serializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.SerializeToString,
                 response_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.FromString,
                 _registered_method=True)
+        self.WatchFrames = channel.stream_stream(
+                '/pointslam.v1.TrackingService/WatchFrames',
+                request_serializer=pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesRequest.SerializeToString,
+                response_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesResponse.FromString,
+                _registered_method=True)
         self.Localize = channel.unary_unary(
                 '/pointslam.v1.TrackingService/Localize',
                 request_serializer=pointslam_dot_v1_dot_tracking__service__pb2.LocalizeRequest.SerializeToString,
@@ -59,6 +64,14 @@ class TrackingServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def WatchFrames(self, request_iterator, context):
+        """Watch a session's map: the camera is found in it and followed, whoever else streams; nothing
+        of the map or of the session's trajectory changes. LOST until it is found.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def Localize(self, request, context):
         """Where in a session's map was this image taken? Open or on disk; nothing of it changes.
         """
@@ -73,6 +86,11 @@ def add_TrackingServiceServicer_to_server(servicer, server):
                     servicer.TrackFrames,
                     request_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.FromString,
                     response_serializer=pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.SerializeToString,
+            ),
+            'WatchFrames': grpc.stream_stream_rpc_method_handler(
+                    servicer.WatchFrames,
+                    request_deserializer=pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesRequest.FromString,
+                    response_serializer=pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesResponse.SerializeToString,
             ),
             'Localize': grpc.unary_unary_rpc_method_handler(
                     servicer.Localize,
@@ -108,6 +126,33 @@ class TrackingService:
             '/pointslam.v1.TrackingService/TrackFrames',
             pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesRequest.SerializeToString,
             pointslam_dot_v1_dot_tracking__service__pb2.TrackFramesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def WatchFrames(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/pointslam.v1.TrackingService/WatchFrames',
+            pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesRequest.SerializeToString,
+            pointslam_dot_v1_dot_tracking__service__pb2.WatchFramesResponse.FromString,
             options,
             channel_credentials,
             insecure,

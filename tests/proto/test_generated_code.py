@@ -35,7 +35,7 @@ def test_every_call_has_request_and_response_types_of_its_own():
         )
     ]
 
-    assert len(calls) == 12
+    assert len(calls) == 13
     assert all((rq, rs) == (f"{name}Request", f"{name}Response") for name, rq, rs in calls)
 
 

@@ -3,7 +3,10 @@
 import json
 import os
 import signal
+import threading
 import time
+from dataclasses import replace
+from itertools import islice
 
 import grpc
 import httpx
@@ -12,6 +15,7 @@ import pytest
 
 from benchmarks import gateway as gateway_benchmark
 from pointslam.client import Client
+from pointslam.client.messages import frame_message
 from pointslam.datasets import open_sequence
 from pointslam.synth import Noise, SynthOptions, record_scene
 from shared.camera import Intrinsics
@@ -108,6 +112,66 @@ def test_every_door_tells_the_same_pose(services, session, room):
     told = httpx.get(f"{services.url}/v1/sessions/{session.name}/pose").json()
     assert pose.T_map_camera.position.x == told["T_map_camera"]["position"]["x"]
     assert pose.T_map_camera.orientation.w == told["T_map_camera"]["orientation"]["w"]
+
+
+def state_of(session):
+    """What a watcher must leave as it is."""
+    info = session.info()
+    told = [(r.seq, r.T_map_camera_online.tobytes()) for r in session.trajectory()]
+    return info["frames"], info["keyframes"], info["map_revision"], told
+
+
+def test_a_second_client_watches_another_stretch_and_leaves_the_map_as_it_is(client, session, room):
+    stream(session, room, 0, 25)
+    session.wait_until_mapped()
+    before = state_of(session)
+
+    def backwards():
+        for number, i in enumerate(reversed(range(8, 23))):
+            frame = room.frame(i)
+            yield frame_message(number, (number + 1) * 33_000_000, frame.rgb, frame.depth)
+
+    with Client(client.url) as other:
+        replies = list(other.session(session.name).watch(backwards()))
+
+    assert replies[0].status is TrackingStatus.RELOCALISED
+    assert {reply.status for reply in replies[1:]} == {TrackingStatus.TRACKED}
+    assert max(errors_m([replace(reply, seq=22 - reply.seq) for reply in replies], room)) < 0.02
+    assert state_of(session) == before
+
+
+def test_a_watcher_follows_while_the_first_client_streams_and_its_death_changes_nothing(
+    client, session, room
+):
+    undisturbed = stream(session, room, 0, 24)
+    again = client.create_session(room.calibration, mode="offline", T_map_first=room.truth(0))
+    stream(again, room, 0, 12)
+    watched = []
+
+    def watch():
+        with Client(client.url) as other:
+            replies = other.session(again.name).watch(frames_at(room, 2, 12))
+            watched.extend(islice(replies, 6))  # and is gone in the middle of it
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    replies = stream(again, room, 12, 24)
+    watcher.join(60.0)
+
+    told = {reply.seq: reply.T_map_camera.matrix() for reply in undisturbed}
+    for reply in replies:
+        np.testing.assert_array_equal(reply.T_map_camera.matrix(), told[reply.seq])
+    assert len(watched) == 6
+    assert max(errors_m(watched, room)) < 0.02
+    assert [record.seq for record in again.trajectory()] == list(range(24))
+    again.delete()
+
+
+def frames_at(room, first, end):
+    """Frames of one who watches, numbered as in the room."""
+    for i in range(first, end):
+        frame = room.frame(i)
+        yield frame_message(i, frame.t_ns, frame.rgb, frame.depth)
 
 
 def test_a_tracker_killed_in_the_middle_loses_no_frame_and_changes_no_pose(
