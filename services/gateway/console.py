@@ -1,4 +1,4 @@
-"""The console and the capture page: files of `web/`, served as they are, without a build step."""
+"""The console, the capture page and that of the API: files of `web/`, served as they are, without a build step."""
 
 from __future__ import annotations
 
@@ -98,6 +98,10 @@ def console_routes() -> APIRouter:
     @router.get("/capture")
     async def capture(request: Request) -> Response:
         return await _respond("capture.html", request)
+
+    @router.get("/docs")
+    async def docs(request: Request) -> Response:
+        return await _respond("docs.html", request)
 
     @router.get("/web/{name:path}")
     async def file(name: str, request: Request) -> Response:

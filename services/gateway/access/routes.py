@@ -35,7 +35,6 @@ HTTP: dict[str, Access] = {
     "GET /healthz": OPEN,
     "GET /readyz": OPEN,
     "GET /docs": OPEN,
-    "GET /docs/oauth2-redirect": OPEN,
     "GET /openapi.json": OPEN,
     "GET /": OPEN,
     "GET /capture": OPEN,
