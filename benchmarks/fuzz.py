@@ -3,8 +3,9 @@
     pointslam bench fuzz [--inputs 10000] [--seed 0] [--json]
 
 Routes are taken from its OpenAPI and its RPCs from the table of scopes; inputs are mutations of
-good ones. It fails when an answer blames the gateway (5xx, INTERNAL, UNKNOWN), the process ends, or
-it holds more memory after the inputs than its allocator explains.
+good ones, and those that schemathesis makes of the OpenAPI. It fails when an answer blames the
+gateway (5xx, INTERNAL, UNKNOWN), the process ends, or it holds more memory after the inputs than
+its allocator explains.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 from benchmarks.fuzz_inputs import spoiled, spoiled_bytes, spoiled_message, strange_word
+from benchmarks.fuzz_openapi import send_cases
 from benchmarks.local_gateway import LocalGateway, local_gateway
 from pointslam.client import Client, frame_message
 from pointslam.client.frame_stream import open_stream
@@ -230,7 +232,15 @@ def fuzz(inputs: int, seed: int) -> dict[str, Outcome]:
         }
         for name, send in doors.items():
             outcomes[name] = _send_all(send, fuzzer.rss_mb, inputs)
+        outcomes["openapi"] = _made_of_openapi(gateway.url, fuzzer.rss_mb, inputs)
     return outcomes
+
+
+def _made_of_openapi(url: str, rss_mb: Callable[[], float], inputs: int) -> Outcome:
+    outcome, before_mb, start = Outcome(), rss_mb(), time.monotonic()
+    send_cases(url, _NAME, inputs, lambda code, what: outcome.count(str(code), code >= 500, what))
+    outcome.seconds, outcome.growth_mb = time.monotonic() - start, rss_mb() - before_mb
+    return outcome
 
 
 def _send_all(send: Callable[[Outcome], None], rss_mb: Callable[[], float], inputs: int) -> Outcome:

@@ -127,7 +127,9 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mappers", type=int, default=1, metavar="N", help="share the sessions")
     parser.add_argument("--gateways", type=int, default=1, metavar="N", help="at ports P, P+1, ...")
     parser.add_argument("--traces", default="", metavar="TARGET", help="http://otlp or file:FOLDER")
-    parser.add_argument("--host", default="127.0.0.1", help="other than loopback needs --keys")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="other than loopback needs --keys or JWT"
+    )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="only with a key of this store")
     parser.add_argument("--tls-certificate", type=Path, metavar="FILE", help="PEM, with its chain")
     parser.add_argument("--tls-key", type=Path, metavar="FILE", help="PEM")

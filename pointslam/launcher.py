@@ -21,6 +21,8 @@ _HOST = "127.0.0.1"
 class Access:
     """Who may use the gateway: by default whoever is on this machine, else who has a key.
 
+    Where the settings name an issuer of JSON web tokens, its tokens let in beside the keys.
+
     The files are those of `pointslam keys create` and of a certificate with its private key (PEM).
     """
 
@@ -29,7 +31,7 @@ class Access:
     tls_certificate: Path | None = None
     tls_key: Path | None = None
 
-    def arguments(self) -> tuple[str, ...]:
+    def arguments(self, settings: ServiceSettings) -> tuple[str, ...]:
         """Words of the gateway's command line."""
         files = {
             "--keys": self.keys,
@@ -37,7 +39,8 @@ class Access:
             "--tls-key": self.tls_key,
         }
         words = [word for name, file in files.items() if file for word in (name, str(file))]
-        return tuple(words) if self.keys else ("--insecure-local", *words)
+        is_guarded = self.keys is not None or settings.has_jwt()
+        return tuple(words) if is_guarded else ("--insecure-local", *words)
 
     def url(self, port: int) -> str:
         """Where the gateway is found from this machine."""
@@ -164,7 +167,7 @@ class Services:
             ("--http-host", options.access.host, "--http-port", str(http), "--grpc-port", str(grpc))
             for http, grpc in zip(self.http_ports, self.grpc_ports, strict=True)
         ]
-        access = options.access.arguments()
+        access = options.access.arguments(options.settings)
         data = ("--data", str(options.data), "--device", options.device)
         return [
             *(command("tracking", name) for name in trackers),

@@ -34,6 +34,13 @@ class ServiceSettings:
         listen = self.by_role.get("router", {}).get("listen")
         return str(listen[0]) if isinstance(listen, list) and listen else None
 
+    def has_jwt(self) -> bool:
+        """Whether the gateway shall take an issuer's tokens."""
+        below: Any = self.by_role.get("gateway", {})
+        for part in ("access", "jwt", "key_file"):
+            below = below.get(part) if isinstance(below, Mapping) else None
+        return bool(below)
+
     def arguments(self, role: str) -> list[str]:
         """`--set key=value` words for a service's command line."""
         words = []

@@ -1,4 +1,4 @@
-"""The console, the capture page and that of the API: files of `web/`, served as they are, without a build step."""
+"""The pages of `web/` (console, capture, API): files served as they are, without a build step."""
 
 from __future__ import annotations
 

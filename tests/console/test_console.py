@@ -135,6 +135,35 @@ def test_a_file_is_downloaded(page, what):
     page.wait_for(f"/: [0-9.]+ [kM]?B\\.$/.test({note})", timeout_s=30.0)
 
 
+@pytest.mark.parametrize("format", ["webm", "mp4"])
+def test_a_video_of_a_path_is_played_by_the_browser(page, format):
+    script = """(async () => {
+      const asked = await fetch('/v1/sessions/room/renders', {method: 'POST',
+        body: JSON.stringify({frames: 4, width: 64, format: '%s'})});
+      const job = asked.headers.get('Location');
+      await (await fetch(`${job}/events`)).text();
+      const video = document.createElement('video');
+      video.muted = true;
+      const ended = new Promise((done, fail) => { video.onended = done; video.onerror = fail; });
+      video.src = `${job}/file`;
+      await video.play();
+      await ended;
+      return [video.videoWidth, video.getVideoPlaybackQuality().totalVideoFrames];
+    })()"""
+
+    assert page.run(script % format) == [64, 4]
+
+
+def test_a_video_around_the_view_is_drawn_until_it_is_stopped(page):
+    page.run("document.getElementById('tour-path').value = 'orbit'")
+    page.click("#tour")
+
+    text = "document.getElementById('tour-text').textContent"
+    page.wait_for(f"/of 150 pictures/.test({text})")
+    page.click("#tour-stop")
+    page.wait_for(f"{text} === 'Video: stopped'")
+
+
 def test_it_fits_a_phone_in_light_colours(console, page):
     page.resize(390, 844, "light")
 

@@ -20,7 +20,6 @@ from jwt.algorithms import ECAlgorithm
 
 from benchmarks.local_gateway import free_port, gateway_process
 from pointslam.client import Client
-from pointslam.launcher import Access
 from services.gateway.access.arguments import add_access_arguments, authority_from, tls_from
 from services.gateway.access.authority import Shown
 from services.gateway.access.identity import JwtVerifier
@@ -79,11 +78,6 @@ def test_a_certificate_that_is_none_is_refused(tmp_path):
 
     with pytest.raises(ConfigError, match="--tls-certificate"):
         tls_from(options("--tls-certificate", word, "--tls-key", word))
-
-
-def test_up_passes_insecure_local_only_without_keys(tmp_path):
-    assert Access().arguments() == ("--insecure-local",)
-    assert Access(keys=tmp_path).arguments() == ("--keys", str(tmp_path))
 
 
 def test_a_bucket_gives_its_burst_and_then_its_rate():

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pointslam.launcher import LaunchOptions
+from pointslam.launcher import Access, LaunchOptions
+from pointslam.settings import read_settings
 from shared.errors import ConfigError
 
 
@@ -14,3 +15,18 @@ from shared.errors import ConfigError
 def test_impossible_services_are_refused(change):
     with pytest.raises(ConfigError):
         LaunchOptions(Path("data"), Path("logs"), **change)
+
+
+@pytest.mark.parametrize(
+    ("access", "words", "expected"),
+    [
+        (Access(), (), ("--insecure-local",)),
+        (Access(keys=Path("keys.db")), (), ("--keys", "keys.db")),
+        (Access(), ("gateway.access.jwt.key_file=issuer.pem",), ()),
+        (Access(), ("gateway.access.jwt.issuer=somebody",), ("--insecure-local",)),
+    ],
+)
+def test_everybody_is_let_in_only_where_nobody_could_show_a_key_or_a_token(access, words, expected):
+    settings = read_settings(None, words).services
+
+    assert access.arguments(settings) == expected

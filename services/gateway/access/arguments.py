@@ -103,7 +103,8 @@ def _check_local(host: str, verifiers: dict[str, Verifier]) -> None:
     if not is_loopback(host):
         raise ConfigError(
             f"--insecure-local with --http-host {host} would let the whole network in; listen on "
-            "127.0.0.1, or make keys with `pointslam keys create` and pass --keys"
+            "127.0.0.1, or make keys with `pointslam keys create` and pass --keys, or name "
+            "an issuer of JSON web tokens in access.jwt"
         )
 
 

@@ -2,6 +2,7 @@
 
 import { Problem, postJson, request, sessionPath } from "./api.js";
 import { byId, setText } from "./dom.js";
+import { save } from "./files.js";
 import { bytes, fixed } from "./text.js";
 
 export class Actions {
@@ -77,11 +78,7 @@ export class Actions {
     this.say(`${what}: asking`);
     const response = await request(sessionPath(this.name, button.dataset.download), { signal: this.signal });
     const file = await this.received(response, what);
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(file);
-    link.download = `${this.name}.${button.dataset.file}`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    save(file, `${this.name}.${button.dataset.file}`);
     this.say(`${what}: ${bytes(file.size)}.`);
   }
 

@@ -8,6 +8,7 @@ import { Events } from "./events.js";
 import { LiveImage } from "./live_image.js";
 import { count, trackingState } from "./text.js";
 import { showFigures } from "./figures.js";
+import { Tour } from "./tour.js";
 import { Viewer } from "./viewer/viewer.js";
 
 const INFO_EVERY_MS = 2000;
@@ -20,6 +21,7 @@ export class SessionPage {
     this.live = new LiveImage();
     this.events = new Events();
     this.actions = new Actions();
+    this.tour = new Tour(() => ({ pose: this.viewer.pose, layer: this.viewer.layer.value }));
     this.closing = new AbortController();
   }
 
@@ -35,7 +37,7 @@ export class SessionPage {
     this.tracking = null;
     this.info = null;
     const { signal } = this.closing;
-    for (const part of [this.viewer, this.compare, this.live, this.events, this.actions]) part.open(name, signal);
+    for (const part of [this.viewer, this.compare, this.live, this.events, this.actions, this.tour]) part.open(name, signal);
     this.follow(signal);
     this.keepInformed(signal);
   }
