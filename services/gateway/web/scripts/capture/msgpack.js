@@ -1,6 +1,6 @@
 /** Values as msgpack, as far as messages to the gateway need it. */
 
-/** Bytes of null, booleans, numbers, strings, Uint8Array, arrays and plain objects. */
+/** Bytes of null, booleans, numbers, BigInts from 0, strings, Uint8Array, arrays and plain objects. */
 export function pack(value) {
   const parts = [];
   write(value, parts);
@@ -11,6 +11,7 @@ function write(value, parts) {
   if (value === null) parts.push(bytes(0xc0));
   else if (typeof value === "boolean") parts.push(bytes(value ? 0xc3 : 0xc2));
   else if (typeof value === "number") writeNumber(value, parts);
+  else if (typeof value === "bigint") parts.push(wide(value));
   else if (typeof value === "string") writeString(value, parts);
   else if (value instanceof Uint8Array) parts.push(sized(0xc6, value.length), value);
   else if (Array.isArray(value)) {
@@ -50,5 +51,13 @@ function sized(code, number) {
   const view = new DataView(new ArrayBuffer(5));
   view.setUint8(0, code);
   view.setUint32(1, number);
+  return new Uint8Array(view.buffer);
+}
+
+/** An unsigned number of 64 bit. */
+function wide(value) {
+  const view = new DataView(new ArrayBuffer(9));
+  view.setUint8(0, 0xcf);
+  view.setBigUint64(1, value);
   return new Uint8Array(view.buffer);
 }
