@@ -44,6 +44,8 @@ class Page:
         self.received_bytes = 0
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
+        # A screenshot of the whole page has no scroll bar, and would be wider than it is cut.
+        self.send("Emulation.setScrollbarsHidden", hidden=True)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         """A DevTools command; hears of events until its answer comes."""

@@ -2,7 +2,7 @@
 
 import { withAccess } from "../access.js";
 import { getJson, request, sessionPath } from "../api.js";
-import { byId, make, setText } from "../dom.js";
+import { byId, make, setText, showBlob } from "../dom.js";
 import { DASH, fixed, length, percent } from "../text.js";
 import { Camera } from "./camera.js";
 import { Mapping } from "./mapping.js";
@@ -53,8 +53,10 @@ async function makeMap() {
   try {
     await depthCamera.start(document.querySelector("main"));
     turnOn("beginning");
-    await new Mapping(depthCamera).run((reply, name) => {
+    await new Mapping(depthCamera).run((reply, name, jpeg) => {
       show(reply);
+      showBlob(byId("seen"), new Blob([jpeg]));
+      byId("picture").dataset.state = "shown";
       byId("session-link").hidden = false;
       byId("session-link").href = `/#${encodeURIComponent(name)}`;
     });

@@ -14,12 +14,12 @@ export class Mapping {
     this.seq = 0;
   }
 
-  /** Begin a session and send frames until the camera ends; `told(reply, name)` hears of each. */
+  /** Begin a session and send frames until the camera ends; `told(reply, name, jpeg)` hears of each. */
   async run(told) {
     for (let seen = await this.camera.next(); seen; seen = await this.camera.next()) {
       if (!this.name) await this.begin(seen.intrinsics);
       const reply = await this.tried(seen);
-      if (reply) told(reply, this.name);
+      if (reply) told(reply, this.name, seen.jpeg);
     }
   }
 
