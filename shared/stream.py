@@ -71,7 +71,8 @@ class ErrorDetail:
 class FrameReply:
     """The answer to one frame: a pose and how good it is, or an error that says why not.
 
-    `pos_std_m` and `rot_std_deg` are one standard deviation. `credit` is how many frames the
+    `pos_std_m` and `rot_std_deg` are one standard deviation. `keyframe`: it is in the map and on
+    disk; a live map's owner that takes long may take it later. `credit` is how many frames the
     client may send before the next reply. `map_problem` says why a live map does not grow at
     present (a full disk, no owner): poses go on, keyframes wait.
     """

@@ -78,7 +78,9 @@ class MappingConfig:
     retry_s: float = 0.2
     live_entries: int = 256  # answered frames that a live session holds unacknowledged
     claim_wait_s: float = 1.0  # for the owner to say that a session is still ours
-    keyframe_wait_s: float = 0.25  # a live session waits so long for a keyframe's acknowledgement
+    keyframe_wait_s: float = 0.03  # a live session waits so long for a keyframe's acknowledgement,
+    keyframe_wait_ratio: float = 2.0  # or so many times what that takes at present,
+    keyframe_max_wait_s: float = 0.25  # and never longer
 
     def __post_init__(self) -> None:
         _check_positive(self, "advance_timeout_s", "question_timeout_s", "retry_s", "live_entries")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from contextvars import Context
 
@@ -20,6 +21,7 @@ from shared.tracing import outgoing, under
 from shared.tracks import Advance
 
 LOGGER = logging.getLogger(__name__)
+_USUAL_STEP = 0.1  # weight of the newest time in the mean
 
 
 class Delivery:
@@ -36,6 +38,7 @@ class Delivery:
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Condition()
         self._failure: PointSlamError | None = None
+        self._usual_s = 0.0  # what an entry takes at present
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -80,8 +83,15 @@ class Delivery:
             return UnavailableError("the map has no owner at present")
         return self._failure
 
-    async def settle(self, timeout_s: float) -> None:
-        """Wait until all entries are acknowledged or refused, or the map has lost its owner."""
+    async def settle(self) -> None:
+        """Wait until all entries are acknowledged or refused, or the map has lost its owner.
+
+        Not much longer than that takes at present: an owner that is gone must not hold poses up.
+        """
+        usual_s = self._config.keyframe_wait_ratio * self._usual_s
+        timeout_s = min(
+            max(self._config.keyframe_wait_s, usual_s), self._config.keyframe_max_wait_s
+        )
         ends = [
             asyncio.create_task(self._taken_or_refused()),
             asyncio.create_task(self._owner.lost.wait()),
@@ -113,7 +123,7 @@ class Delivery:
             try:
                 if entry.record.seq > self._owner.logged_seq:
                     with under(traceparent):
-                        await self._owner.advance(entry)
+                        await self._advance(entry)
             except ClaimLostError as error:
                 self._forget()
                 await self._tell(error)
@@ -130,6 +140,13 @@ class Delivery:
                 continue
             self._entries.popleft()
             await self._tell(None)
+
+    async def _advance(self, entry: Advance) -> None:
+        start_s = time.monotonic()
+        await self._owner.advance(entry)
+        if entry.keyframe is not None:
+            took_s = min(time.monotonic() - start_s, self._config.keyframe_max_wait_s)
+            self._usual_s += _USUAL_STEP * (took_s - self._usual_s)
 
     async def _tell(self, failure: PointSlamError | None) -> None:
         self._failure = failure

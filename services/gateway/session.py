@@ -217,6 +217,8 @@ class Session:
         self.poses.add(entry.record, result.map_revision, self.owner.keyframes)
         total_ms = 1e3 * (time.perf_counter() - start)
         reply = reply_of(result, {"queue": waited_ms, "gateway": total_ms})
+        if self._delivery.holds_keyframe:
+            reply = dataclasses.replace(reply, keyframe=False)  # it may be, but is not yet
         problem = self._delivery.problem
         if problem is not None:
             reply = dataclasses.replace(reply, map_problem=detail(problem))
@@ -286,7 +288,7 @@ class Session:
         await self._delivery.put(entry)
         if entry.keyframe is not None:
             # Trackers ask for the neighbourhood of this keyframe with the next frame.
-            await self._delivery.settle(self._fabric.config.mapping.keyframe_wait_s)
+            await self._delivery.settle()
 
 
 def _claim_lost(session: str) -> ClaimLostError:

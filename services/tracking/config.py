@@ -241,7 +241,7 @@ class TrackingConfig:
     context_cache: int = 8  # contexts kept, over all sessions
     concurrent_frames: int = 2
     query_timeout_s: float = 5.0
-    map_patience_s: float = 0.08  # live: then the last neighbourhood that is cached must do
+    map_patience_s: float = 0.03  # live: then the last neighbourhood that is cached must do
 
     def __post_init__(self) -> None:
         _require_positive(self, "context_cache", "concurrent_frames")

@@ -25,8 +25,11 @@ class MapSource(Protocol):
         """The neighbourhood of a keyframe; of the newest one for -1."""
         ...
 
-    def loop_map(self, seq: int) -> LocalMap:
-        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+    def loop_map(self, seq: int) -> LocalMap | None:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only.
+
+        None where it cannot be had in time.
+        """
         ...
 
     def candidates(self, request: CandidatesRequest) -> Candidates:

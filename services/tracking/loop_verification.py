@@ -28,7 +28,8 @@ def find_loop(job: Job, estimate: Estimate, observations: Observations) -> LoopC
         observations: of the keyframe that it becomes.
     """
     for seq in estimate.local.context.loop_seqs[: job.config.loop.max_candidates]:
-        there = _measure(job, estimate, job.source.loop_map(int(seq)))
+        local = job.source.loop_map(int(seq))
+        there = None if local is None else _measure(job, estimate, local)
         if there is not None:
             return _constraint(there, observations)
     return None

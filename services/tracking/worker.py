@@ -42,6 +42,7 @@ class ContextCache:
         self._limit = limit
         self._lock = threading.Lock()
         self._maps: OrderedDict[ContextKey, LocalMap] = OrderedDict()
+        self._silent: set[str] = set()  # sessions whose owner did not answer in time
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -69,8 +70,18 @@ class ContextCache:
         with self._lock:
             self._maps[key] = local
             self._maps.move_to_end(key)
+            self._silent.discard(key[0])
             while len(self._maps) > self._limit:
                 self._maps.popitem(last=False)
+
+    def note_silence(self, session: str) -> None:
+        """The owner of a session's map did not answer in time."""
+        with self._lock:
+            self._silent.add(session)
+
+    def is_silent(self, session: str) -> bool:
+        """Whether the owner has given no map since it did not answer in time."""
+        return session in self._silent
 
 
 def _shows(local: LocalMap, seq: int) -> bool:
@@ -122,9 +133,15 @@ class BusSource:
         if older is None:
             return ahead.result()
         try:
-            return ahead.result(self._config.map_patience_s)
+            return ahead.result(self._patience_s())
         except (UnavailableError, TimeoutError):
+            self._cache.note_silence(self._request.session)
             return older  # what comes late is there for the next frame
+
+    def _patience_s(self) -> float:
+        """For the owner of a live map; one frame waits for an owner that is gone, and no more."""
+        is_silent = self._cache.is_silent(self._request.session)
+        return 0.0 if is_silent else self._config.map_patience_s
 
     def _older_map(self) -> LocalMap | None:
         request = self._request
@@ -134,10 +151,22 @@ class BusSource:
             request.session, request.prior.reference_seq if request.prior else -1
         )
 
-    def loop_map(self, seq: int) -> LocalMap:
-        """The neighbourhood of a keyframe, of what is near to it in the graph only."""
+    def loop_map(self, seq: int) -> LocalMap | None:
+        """The neighbourhood of a keyframe, of what is near to it in the graph only.
+
+        None where an older map must do: then this keyframe closes no loop.
+        """
         ahead = self._ahead.get((seq, True))
-        return self._local_map(seq, is_near_only=True) if ahead is None else ahead.result()
+        has_older = self._older_map() is not None
+        is_silent = has_older and self._cache.is_silent(self._request.session)
+        try:
+            if ahead is not None:
+                return ahead.result(0.0 if is_silent else None)
+            return None if is_silent else self._local_map(seq, is_near_only=True)
+        except (UnavailableError, TimeoutError):
+            if not has_older:
+                raise
+            return None
 
     def _local_map(self, reference_seq: int, is_near_only: bool = False) -> LocalMap:
         session, epoch = self._request.session, self._request.epoch

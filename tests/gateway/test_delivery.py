@@ -20,10 +20,11 @@ def entry(seq):
     return Advance(FrameRecord(seq, seq, TrackingStatus.TRACKED, 0, T, T, np.eye(6)))
 
 
-def to_owner(advance, lost=None):
+def to_owner(advance, lost=None, wait_s=60.0):
     owner = SimpleNamespace(session="room", logged_seq=-1, advance=advance)
     owner.lost = lost or asyncio.Event()
-    return Delivery(owner, MappingConfig(retry_s=0.01))  # pyright: ignore[reportArgumentType]
+    config = MappingConfig(retry_s=0.01, keyframe_wait_s=wait_s, keyframe_max_wait_s=wait_s)
+    return Delivery(owner, config)  # pyright: ignore[reportArgumentType]
 
 
 async def delivered(refusals):
@@ -63,7 +64,7 @@ def test_a_full_disk_is_told_until_there_is_room_and_nothing_is_lost():
 
         delivery = to_owner(advance)
         await delivery.put(entry(0))
-        await delivery.settle(10.0)
+        await delivery.settle()
         problem = delivery.problem
         is_full.clear()
         await delivery.flush(10.0)
@@ -82,9 +83,28 @@ def test_nobody_waits_for_an_owner_that_is_lost():
 
         delivery = to_owner(advance, lost)
         await delivery.put(entry(0))
-        await asyncio.wait_for(delivery.settle(60.0), 10.0)
+        await asyncio.wait_for(delivery.settle(), 10.0)
         problem = delivery.problem
         delivery.give_up()
         return str(problem)
 
     assert "no owner" in asyncio.run(run())
+
+
+def test_an_owner_that_keeps_silent_holds_no_pose_up_and_gets_its_entry_later():
+    async def run():
+        taken, wakes = [], asyncio.Event()
+
+        async def advance(entry):
+            await wakes.wait()
+            taken.append(entry.record.seq)
+
+        delivery = to_owner(advance, wait_s=0.01)
+        await delivery.put(entry(0))
+        await asyncio.wait_for(delivery.settle(), 30.0)
+        before = list(taken)
+        wakes.set()
+        await delivery.flush(30.0)
+        return before, taken
+
+    assert asyncio.run(run()) == ([], [0])
