@@ -218,17 +218,22 @@ def _visible_hessians(  # noqa: C901 - compiled
     for k in range(len(views)):
         T = views[k]
         for n in range(len(points)):
-            for i in range(3):
-                p[i] = T[i, 3]
-                m[i] = 0.0
-                for j in range(3):
-                    p[i] += T[i, j] * points[n, j]
-                    m[i] += T[i, j] * normals[n, j]
-            if p[2] < 0.1 or p[0] * m[0] + p[1] * m[1] + p[2] * m[2] >= 0.0:
+            # Most points are out of sight: normals are turned for the others only.
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            p[2] = T[2, 3] + T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+            if p[2] < 0.1:
                 continue
+            p[0] = T[0, 3] + T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
+            p[1] = T[1, 3] + T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
             u = camera[0] * p[0] / p[2] + camera[2]
             v = camera[1] * p[1] / p[2] + camera[3]
             if u < 0.0 or v < 0.0 or u >= camera[4] or v >= camera[5]:
+                continue
+            for i in range(3):
+                m[i] = 0.0
+                for j in range(3):
+                    m[i] += T[i, j] * normals[n, j]
+            if p[0] * m[0] + p[1] * m[1] + p[2] * m[2] >= 0.0:
                 continue
             weight = 1.0 / (noise[0] + noise[1] * p[2] * p[2]) ** 2
             J[0], J[1], J[2] = m[0], m[1], m[2]
