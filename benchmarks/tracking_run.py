@@ -160,6 +160,24 @@ class Row:
     cold_worker: ColdWorker | None = None
 
 
+@dataclass(frozen=True)
+class Tracked:
+    """Results of a sequence's frames, and the map that they made."""
+
+    results: list[TrackResult]
+    store: KeyframeStore
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """Which frames have a pose, [F]."""
+        return np.array([result.status in HAS_POSE for result in self.results])
+
+    def final_poses(self) -> Poses:
+        """T_world_camera of the frames that have one, as the map corrected them at last."""
+        found = [result for result in self.results if result.status in HAS_POSE]
+        return np.stack([self.store.pose(r.reference_seq) @ r.T_reference_camera for r in found])
+
+
 def run(
     folder: Folder,
     name: str,
@@ -167,6 +185,18 @@ def run(
     config: TrackingConfig,
     keyframes: KeyframeConfig | None = None,
 ) -> Row:
+    """Track the frames in order, as `track_all` does, beside the truth."""
+    tracked = track_all(folder, indices, config, keyframes)
+    truth = np.stack([folder.true_pose(index) for index in indices])
+    return _row(name, tracked, truth, config)
+
+
+def track_all(
+    folder: Folder,
+    indices: list[int],
+    config: TrackingConfig,
+    keyframes: KeyframeConfig | None = None,
+) -> Tracked:
     """Track the frames in order, as the gateway and the map's owner would let it happen."""
     store = KeyframeStore(keyframes)
     prior: Prior | None = None
@@ -182,8 +212,7 @@ def run(
                 source.build_ahead(index)
             prior = next_prior(prior, request.frame, result)
             results.append(result)
-    truth = np.stack([folder.true_pose(index) for index in indices])
-    return _row(name, results, truth, store, config)
+    return Tracked(results, store)
 
 
 def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> TrackRequest:
@@ -198,18 +227,10 @@ def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> 
     )
 
 
-def _row(
-    name: str,
-    results: list[TrackResult],
-    truth: Poses,
-    store: KeyframeStore,
-    config: TrackingConfig,
-) -> Row:
-    has_pose = np.array([result.status in HAS_POSE for result in results])
-    found = [result for result in results if result.status in HAS_POSE]
-    online = np.stack([result.T_world_camera for result in found])
-    final = np.stack([store.pose(r.reference_seq) @ r.T_reference_camera for r in found])
-    truth = truth[has_pose]
+def _row(name: str, tracked: Tracked, truth: Poses, config: TrackingConfig) -> Row:
+    results, store, has_pose = tracked.results, tracked.store, tracked.has_pose
+    online = np.stack([r.T_world_camera for r in results if r.status in HAS_POSE])
+    final, truth = tracked.final_poses(), truth[has_pose]
     rpe1, rpe30 = relative_errors(final, truth, 1), relative_errors(final, truth, 30)
     totals = [result.timings_ms["total"] for result in results]
     names = sorted({stage for result in results for stage in result.timings_ms})
@@ -238,7 +259,12 @@ def _row(
 
 
 def absolute_error(poses: Poses, truth: Poses) -> float:
-    """ATE: root mean square distance after rigid alignment without scale (Umeyama), metres."""
+    """ATE: root mean square distance after rigid alignment without scale (Umeyama), metres.
+
+    NaN for fewer than three poses: anything can be aligned to these.
+    """
+    if len(poses) < 3:
+        return float("nan")
     a, b = poses[:, :3, 3], truth[:, :3, 3]
     u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

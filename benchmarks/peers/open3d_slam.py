@@ -23,6 +23,8 @@ class Open3dSlam:
 
     def __init__(self) -> None:
         device = o3d.core.Device("CPU:0")
+        # Its notes go to the standard output, where our table or JSON is.
+        o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
         T_world_camera = tensor(np.eye(4))
         self._model = o3d.t.pipelines.slam.Model(
             _VOXEL_M, _BLOCK_VOXELS, _NUM_BLOCKS, T_world_camera, device

@@ -7,7 +7,10 @@ from benchmarks import tracking_variants
 from benchmarks.cold_worker import cold_worker
 from benchmarks.peers.opencv_odometry import OpencvOdometry
 from benchmarks.peers.registry import PEERS, PeerEntry
-from services.tracking.config import TrackingConfig
+from benchmarks.tracking_run import absolute_error
+from benchmarks.truth import register_pair
+from services.tracking.config import SurfaceConfig, TrackingConfig
+from services.tracking.point_cloud import surface_from_depth
 from shared.config import override, read_overrides
 from shared.se3 import exp
 
@@ -71,3 +74,24 @@ def test_a_cold_worker_costs_building_sending_and_deriving(new_session, room):
     cost = cold_worker(session.store, TrackingConfig())
 
     assert min(cost.build_ms, cost.wire_ms, cost.derive_ms, cost.context_kb) > 0.0
+
+
+def test_two_poses_have_no_absolute_error():
+    poses = np.stack([step(0), step(1)])
+
+    assert np.isnan(absolute_error(poses, poses))
+
+
+def test_a_truth_that_is_off_is_told_from_a_pose_that_is_right(room):
+    T = np.linalg.inv(CORNER) @ (CORNER @ step(5))
+    earlier, later = (
+        surface_from_depth(view.depth_m, view.intrinsics, SurfaceConfig(stride_px=2))
+        for view in (room.view(CORNER), room.view(CORNER @ step(5)))
+    )
+    off = T @ exp([0.02, 0.0, 0.01, 0.0, 0.0, 0.01])
+
+    pair = register_pair(earlier, later, off, T)
+
+    np.testing.assert_allclose(pair.from_true, T, atol=1e-3)
+    np.testing.assert_allclose(pair.from_tracked, T, atol=1e-3)
+    assert pair.residuals_mm[0] > 3.0 * max(pair.residuals_mm[1:])
