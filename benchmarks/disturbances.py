@@ -122,6 +122,46 @@ class MovingBox:
         return np.maximum(self._depth_m - T[2, 3], 0.5) / np.maximum(rays @ T[2, :3], 0.1)
 
 
+class CarriedPlane:
+    """A sequence filmed past a textured board that is fixed to the camera and hides a share of it.
+
+    Nothing of the board's image changes but that it appears: in depth and colour it says that the
+    camera stands still.
+    """
+
+    def __init__(
+        self, sequence: Sequence, share: float = 0.36, depth_m: float = 0.6, from_index: int = 0
+    ) -> None:
+        self.calibration = sequence.calibration
+        self._sequence = sequence
+        self._side = float(np.sqrt(share))
+        self._depth_m = depth_m
+        self._from_index = from_index
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def true_pose(self, index: int) -> NDArray[np.float64]:
+        """T_world_camera, [4, 4]."""
+        return self._sequence.true_pose(index)
+
+    def frame(self, index: int) -> Frame:
+        """One frame; the board is in the middle of it, tilted by a few degrees."""
+        frame, size = self._sequence.frame(index), self.calibration.colour.intrinsics
+        if index < self._from_index:
+            return frame
+        rgb = decode_colour(frame.rgb, size).copy()
+        depth_m = decode_depth(frame.depth, self.calibration)
+        height, width = int(self._side * size.height), int(self._side * size.width)
+        left, top = (size.width - width) // 2, (size.height - height) // 2
+        board = np.s_[top : top + height, left : left + width]
+        rgb[board] = _texture(height, width)
+        depth_m[board] = self._depth_m / (1.0 + 0.1 * np.linspace(-1.0, 1.0, width))
+        return _with_depth(
+            dataclasses.replace(frame, rgb=encode_jpeg(rgb, 95)), depth_m, self.calibration
+        )
+
+
 def _texture(height: int, width: int) -> NDArray[np.uint8]:
     """The box's side: random squares, always the same."""
     cells = np.random.default_rng(7).integers(0, 256, (height // 9 + 1, width // 9 + 1, 3))

@@ -11,6 +11,7 @@ from shared.camera import Calibration
 from shared.frames import Frame, Prior, TrackingStatus
 
 NO_LANDMARK = -1
+MOVING = -2  # in place of a landmark: the feature is of something that moves
 KEYPOINT_BITS = 16
 
 
@@ -34,7 +35,7 @@ class Observations:
     Keypoints are pixels of the rectified colour image; depth is 0 where none is reliable.
     """
 
-    landmark_ids: NDArray[np.int64]  # [M], NO_LANDMARK where a feature has none
+    landmark_ids: NDArray[np.int64]  # [M], NO_LANDMARK or MOVING where a feature has none
     keypoints_px: NDArray[np.float32]  # [M, 2]
     octaves: NDArray[np.uint8]  # [M], pyramid level; the pixel sigma is 1.2 ** octave
     depths_m: NDArray[np.float32]  # [M]
@@ -60,7 +61,7 @@ class WindowKeyframe:
     seq: int
     T_world_camera: NDArray[np.float64]  # [4, 4]
     is_fixed: bool  # observed, never moved
-    observations: Observations  # those of the context's landmarks only
+    observations: Observations  # those of the context's landmarks, and of what moves
     edge_blur_px: float = 0.0
 
 

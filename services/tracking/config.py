@@ -131,6 +131,26 @@ class VerificationConfig:
 
 
 @dataclass(frozen=True)
+class MovingConfig:
+    """What in a frame moves otherwise than the map."""
+
+    grid_px: int = 4  # of the depth image that is split into surfaces, at 640x480
+    max_jump: float = 0.05  # of a surface's depth from one cell of the grid to the next
+    still_px: float = 1.5  # at 640x480; from where a keyframe saw the same feature
+    still_depth: float = 0.02  # relative
+    still_bits: int = 60
+    min_still: int = 15  # features of a surface, to say that it goes with the camera
+    min_still_share: float = 0.4
+    min_free: int = 12  # points of a surface in free space, of every fourth that is seen
+    min_free_share: float = 0.5
+    min_share: float = 0.04  # of the frame's points: less does no harm
+    max_share: float = 0.75  # beyond it there is nothing left to tell the pose by
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "grid_px", "still_px", "min_still", "min_free")
+
+
+@dataclass(frozen=True)
 class RelocalizationConfig:
     """Pose from features alone."""
 
@@ -232,6 +252,7 @@ class TrackingConfig:
     orb: OrbConfig = field(default_factory=OrbConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
+    moving: MovingConfig = field(default_factory=MovingConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     feature_start: FeatureStartConfig = field(default_factory=FeatureStartConfig)
     loop: LoopVerificationConfig = field(default_factory=LoopVerificationConfig)

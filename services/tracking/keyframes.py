@@ -17,6 +17,7 @@ from shared.frames import Frame, Prior
 from shared.rectify import RgbdImage
 from shared.se3 import angle_rad, inverse
 from shared.tracks import (
+    MOVING,
     NO_LANDMARK,
     Correction,
     KeyframeData,
@@ -121,6 +122,19 @@ def keyframe_observations(
         octaves=features.octaves,
         depths_m=features.depths_m,
         descriptors=features.descriptors,
+    )
+
+
+def with_moving(observations: Observations, moving: Features) -> Observations:
+    """A keyframe's observations and, after them, the features of what moves."""
+    ids = np.full(len(moving.octaves), MOVING, np.int64)
+    seen = observations
+    return Observations(
+        landmark_ids=np.concatenate([seen.landmark_ids, ids]),
+        keypoints_px=np.concatenate([seen.keypoints_px, moving.keypoints_px]),
+        octaves=np.concatenate([seen.octaves, moving.octaves]),
+        depths_m=np.concatenate([seen.depths_m, moving.depths_m]),
+        descriptors=np.concatenate([seen.descriptors, moving.descriptors]),
     )
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
+from services.tracking.carried import SeenFeatures
 from services.tracking.config import RegistrationConfig
 from services.tracking.voxel_map import VoxelMap, build_voxel_map
+from shared.free_space import FreeSpace, seen_through
+from shared.se3 import inverse
 from shared.tracks import Candidates, CandidatesRequest, TrackingContext
 
 
@@ -16,6 +20,22 @@ class LocalMap:
 
     context: TrackingContext
     voxels: VoxelMap
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """What the reference keyframe sees through, to the map."""
+        T_reference_world = inverse(self.context.T_world_reference)
+        return seen_through(self.context.cloud_world.points, T_reference_world)
+
+    @cached_property
+    def seen(self) -> SeenFeatures:
+        """What the window's keyframes saw."""
+        return SeenFeatures.of(self.context.window, only_moving=False)
+
+    @cached_property
+    def seen_moving(self) -> SeenFeatures:
+        """What of it is known to move."""
+        return SeenFeatures.of(self.context.window, only_moving=True)
 
 
 class MapSource(Protocol):

@@ -44,15 +44,15 @@ def match_by_projection(
     best, distances = _search(
         landmarks.positions_world,
         landmarks.normals_world,
-        _words(landmarks.descriptors),
+        words_of(landmarks.descriptors),
         landmarks.octaves,
         landmarks.distances_m,
         inverse(T_world_camera),
         np.array([i.fx, i.fy, i.cx, i.cy]),
-        _grid(features.keypoints_px, i.width, i.height),
+        grid_of(features.keypoints_px, i.width, i.height),
         features.keypoints_px,
         features.octaves,
-        _words(features.descriptors),
+        words_of(features.descriptors),
         np.array([config.search_radius_px, config.max_hamming_bits, config.ratio]),
     )
     return _one_to_one(best, distances, len(features.octaves))
@@ -78,14 +78,15 @@ def two_nearest(
     descriptors: NDArray[np.uint8], others: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Of each descriptor [M, 32] among others [L, 32]: the nearest row, its bits, the second's."""
-    return _two_nearest(_words(descriptors), np.ascontiguousarray(_words(others).T))
+    return _two_nearest(words_of(descriptors), np.ascontiguousarray(words_of(others).T))
 
 
 def _no_matches() -> Matches:
     return Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+def words_of(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """ORB descriptors [M, 32] as 64 bit words, [M, 4]."""
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
 
 
@@ -119,7 +120,7 @@ def _wins(best, distances, num_features):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _grid(pixels, width, height):  # pragma: no cover - compiled
+def grid_of(pixels, width, height):  # pragma: no cover - compiled
     """Features by cell: starts [cells + 1], rows in cell order, cells a row of the image."""
     columns, rows = width // _CELL_PX + 1, height // _CELL_PX + 1
     cells = np.empty(len(pixels), np.int64)

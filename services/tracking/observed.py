@@ -8,14 +8,14 @@ after the other, with the same result to the bit.
 from __future__ import annotations
 
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.orb import Features, Keypoints, detect, with_depth
+from services.tracking.orb import Features, Keypoints, detect, no_features, with_depth
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.stopwatch import Stopwatch
 from shared.camera import Calibration, Intrinsics
@@ -50,6 +50,7 @@ class Observed:
     cloud: PointCloud  # camera frame
     appearance: Future[Appearance]
     config: TrackingConfig
+    moving: Features = field(default_factory=no_features)  # of what moves, left out above
 
     @cached_property
     def image(self) -> RgbdImage:
@@ -68,6 +69,32 @@ class Observed:
             InputError: the colour image cannot be decoded.
         """
         return with_depth(self.appearance.result().keypoints, self.depth_m, self.config.orb)
+
+    def without(self, moving: NDArray[np.bool_]) -> Observed:
+        """The frame as if nothing were to be seen at some pixels, [H, W]; waits for features.
+
+        Features are looked for again: a body with a bold pattern takes them all to itself.
+
+        Raises:
+            InputError: the colour image cannot be decoded.
+        """
+        i, points = self.intrinsics, self.cloud.points
+        pixels = np.floor(points[:, :2] / points[:, 2:] * [i.fx, i.fy] + [i.cx + 0.5, i.cy + 0.5])
+        u, v = pixels.astype(np.int64).clip(0, [i.width - 1, i.height - 1]).T
+        stays = ~moving[v, u]
+        pixels = self.features.keypoints_px.astype(np.int64)
+        on_it = np.flatnonzero(moving[pixels[:, 1], pixels[:, 0]] & (self.features.depths_m > 0.0))
+        appearance: Future[Appearance] = Future()
+        rgb = self.appearance.result().rgb
+        appearance.set_result(Appearance(rgb, detect(rgb, self.config.orb, ~moving)))
+        return Observed(
+            depth_m=np.where(moving, np.float32(0.0), self.depth_m),
+            intrinsics=i,
+            cloud=PointCloud(points[stays], self.cloud.normals[stays]),
+            appearance=appearance,
+            config=self.config,
+            moving=self.features.rows(on_it),
+        )
 
     def wait(self) -> None:
         """Until the features are found.

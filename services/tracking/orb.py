@@ -38,11 +38,12 @@ class Features:
 
     def first(self, count: int) -> Features:
         """The best ones."""
+        return self.rows(np.arange(min(count, len(self.octaves))))
+
+    def rows(self, rows: NDArray[np.int64]) -> Features:
+        """Some of them."""
         return Features(
-            self.keypoints_px[:count],
-            self.octaves[:count],
-            self.descriptors[:count],
-            self.depths_m[:count],
+            self.keypoints_px[rows], self.octaves[rows], self.descriptors[rows], self.depths_m[rows]
         )
 
 
@@ -61,8 +62,10 @@ def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
     return with_depth(detect(image.rgb, config), image.depth_m, config)
 
 
-def detect(rgb: NDArray[np.uint8], config: OrbConfig) -> Keypoints:
-    """Detect, spread over cells, describe.
+def detect(
+    rgb: NDArray[np.uint8], config: OrbConfig, where: NDArray[np.bool_] | None = None
+) -> Keypoints:
+    """Detect where the mask [H, W] allows it, spread over cells, describe.
 
     OpenCV keeps the strongest corners wherever they crowd; the pose wants them all over the image,
     so more are detected and each cell gives its best ones in turn.
@@ -73,7 +76,9 @@ def detect(rgb: NDArray[np.uint8], config: OrbConfig) -> Keypoints:
         nlevels=config.num_levels,
         fastThreshold=config.fast_threshold,
     )
-    keypoints, descriptors = orb.detectAndCompute(grey, None)
+    keypoints, descriptors = orb.detectAndCompute(
+        grey, None if where is None else where.astype(np.uint8)
+    )
     if not keypoints:
         return _no_keypoints()
     pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
@@ -92,6 +97,13 @@ def with_depth(keypoints: Keypoints, depth_m: NDArray[np.float32], config: OrbCo
         depth_m, keypoints.keypoints_px, config.max_depth_spread, config.max_feature_depth_m
     )
     return Features(keypoints.keypoints_px, keypoints.octaves, keypoints.descriptors, depths)
+
+
+def no_features() -> Features:
+    """An image without any."""
+    none = _no_keypoints()
+    depths_m = np.zeros(0, np.float32)
+    return Features(none.keypoints_px, none.octaves, none.descriptors, depths_m)
 
 
 def _no_keypoints() -> Keypoints:

@@ -25,6 +25,7 @@ from services.tracking.keyframes import (
     keyframe_observations,
     nearest_reference,
     sharpness_of,
+    with_moving,
 )
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.loop_verification import find_loop
@@ -77,6 +78,7 @@ def track(
     found = search(job, local)
     if found.estimate is None:
         return _lost(job, local)
+    job = replace(job, observed=found.observed)
     with clock.stage("keyframe"):
         keyframe = _new_keyframe(job, found, helper)
     return _answer(job, found, keyframe)
@@ -163,6 +165,7 @@ def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | No
         return None
     ids = estimate.landmark_ids(len(observed.features.octaves))
     observations = keyframe_observations(frame.seq, observed.features, ids)
+    observations = with_moving(observations, observed.moving)
     inspection = helper.submit(_inspect, job, estimate, coverage, observations)
     data = _keyframe(job, estimate, observations)
     inspected = inspection.result()

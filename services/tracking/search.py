@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from services.tracking.config import TrackingConfig, VerificationConfig
 from services.tracking.estimate import Estimate, attempt, pose_covariance
 from services.tracking.keyframes import is_well_known
 from services.tracking.local_map import LocalMap, MapSource
+from services.tracking.moving import find_moving, known_moving
 from services.tracking.observed import Observed
 from services.tracking.prediction import is_predictable, predict, turned_starts
 from services.tracking.relocalization import Recovery, is_found, locate, recover
@@ -65,6 +66,7 @@ class Found:
 
     status: TrackingStatus
     estimate: Estimate | None
+    observed: Observed  # without what moves
 
 
 def search(job: Job, local: LocalMap) -> Found:
@@ -72,6 +74,7 @@ def search(job: Job, local: LocalMap) -> Found:
 
     Where geometry alone leaves the pose open, a place that is known beyond doubt goes first.
     """
+    job = _without_known(job, local)
     nearby = _search_nearby(job, local)
     if nearby.status is TrackingStatus.TRACKED or _is_held(nearby, job.config):
         return nearby
@@ -90,8 +93,32 @@ def _is_held(found: Found, config: TrackingConfig) -> bool:
 def _search_nearby(job: Job, local: LocalMap) -> Found:
     """The best of the attempts around the prior, if it is believed."""
     best = _best_nearby(job, local)
-    status = TrackingStatus.LOST if best is None else _status(job, best)
-    return Found(status, None if status is TrackingStatus.LOST else best)
+    if best is None:
+        return Found(TrackingStatus.LOST, None, job.observed)
+    job, best = _without_moving(job, local, best)
+    status = _status(job, best)
+    return Found(status, None if status is TrackingStatus.LOST else best, job.observed)
+
+
+def _without_known(job: Job, local: LocalMap) -> Job:
+    """The job without what the keyframes around know to go with the camera."""
+    with job.clock.stage("moving"):
+        moving = known_moving(job.observed, local, job.config.moving)
+        return job if moving is None else replace(job, observed=job.observed.without(moving))
+
+
+def _without_moving(job: Job, local: LocalMap, estimate: Estimate) -> tuple[Job, Estimate]:
+    """The job and its estimate, without what moves otherwise than the map where there is such."""
+    config = job.config.moving
+    with job.clock.stage("moving"):
+        moving = find_moving(job.observed, local, estimate.T_world_camera, config)
+        if moving is None:
+            return job, estimate
+        rest = replace(job, observed=job.observed.without(moving.mask))
+    found = _best([rest.attempt(local, T) for T in _starts_around(job, estimate)])
+    if not moving.is_confirmed(found.T_world_camera, job.observed, config):
+        return job, estimate
+    return rest, found
 
 
 def _best_nearby(job: Job, local: LocalMap) -> Estimate | None:
@@ -134,6 +161,16 @@ def _is_enough(job: Job, estimate: Estimate, T_predicted: NDArray[np.float64]) -
         or is_as_predicted(estimate, T_predicted, config)
         or is_only_seen(estimate, config)
     )
+
+
+def _starts_around(job: Job, estimate: Estimate) -> list[NDArray[np.float64]]:
+    """Where the camera was expected, and where it was found if that is elsewhere."""
+    assert job.request.prior is not None
+    config = job.config.verification
+    predicted = predict(job.request.prior, job.request.frame)
+    near = Step(config.near_step_m, config.near_step_deg)
+    is_near = step_between(predicted, estimate.T_world_camera).is_within(near)
+    return [predicted] if is_near else [predicted, estimate.T_world_camera]
 
 
 def _is_doubtful(
@@ -245,5 +282,5 @@ def _relocalise(job: Job) -> Found:
         )
     )
     if recovered.is_believed:
-        return Found(TrackingStatus.RELOCALISED, recovered.estimate)
-    return Found(TrackingStatus.LOST, None)
+        return Found(TrackingStatus.RELOCALISED, recovered.estimate, job.observed)
+    return Found(TrackingStatus.LOST, None, job.observed)

@@ -1,3 +1,4 @@
+import dataclasses
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ from shared.errors import ConfigError
 from shared.se3 import exp, inverse, transform
 from shared.tracks import (
     KEYPOINT_BITS,
+    MOVING,
     Correction,
     KeyframeData,
     Observations,
@@ -173,6 +175,45 @@ def test_windows_observe_only_landmarks_of_the_context():
 
     seen = np.concatenate([k.observations.landmark_ids for k in context.window])
     assert set(seen.tolist()) <= set(context.landmarks.ids.tolist())
+
+
+def board_in_one_keyframe(moving: bool) -> KeyframeStore:
+    """The first of two keyframes has a board before the wall, the second sees through it."""
+    store = KeyframeStore()
+    first, second = keyframe(0), keyframe(1)
+    board = np.random.default_rng(5).uniform([-0.2, -0.2, 1.0], [0.2, 0.2, 1.0], (500, 3))
+    wall = first.cloud_camera
+    cloud = PointCloud(
+        np.concatenate([wall.points, board.astype(np.float32)]),
+        np.concatenate([wall.normals, np.tile(np.array([0, 0, -1], np.float32), (500, 1))]),
+    )
+    store.insert(0, 0, pose(0), dataclasses.replace(first, cloud_camera=cloud))
+    if moving:
+        ids = second.observations.landmark_ids.copy()
+        ids[:20] = MOVING
+        seen = dataclasses.replace(second.observations, landmark_ids=ids)
+        second = dataclasses.replace(second, observations=seen)
+    store.insert(10, 1, pose(1), second)
+    return store
+
+
+def test_where_something_moves_what_the_reference_sees_through_is_left_out():
+    points = board_in_one_keyframe(moving=True).context(10).cloud_world.points
+
+    assert (points[:, 2] > WALL_M - 0.1).all()
+
+
+def test_where_nothing_moves_what_one_keyframe_missed_stays():
+    points = board_in_one_keyframe(moving=False).context(10).cloud_world.points
+
+    assert (points[:, 2] < 1.1).sum() > 100
+
+
+def test_windows_observe_what_moves_too():
+    window = board_in_one_keyframe(moving=True).context(10).window
+
+    assert (window[-1].observations.landmark_ids == MOVING).sum() == 20
+    assert (window[0].observations.landmark_ids == MOVING).sum() == 0
 
 
 def test_one_revision_and_reference_have_one_context():

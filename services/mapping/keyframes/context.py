@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from services.mapping.anchors.membership import is_among
 from services.mapping.keyframes.voxel_merge import merge_clouds
 from shared.errors import ConfigError
+from shared.free_space import seen_through
 from shared.se3 import inverse, rotate, transform
 from shared.tracks import (
     KEYPOINT_BITS,
+    MOVING,
     Landmarks,
     Observations,
     PointCloud,
@@ -197,12 +199,23 @@ def _count_visible(  # noqa: PLR0913 - compiled
 
 def _merged_cloud(keyframes: list[StoredKeyframe], config: ContextConfig) -> PointCloud:
     # Voxels are in order of first sight, best overlap first: the tail is what matters least.
-    return merge_clouds(
+    merged = merge_clouds(
         [keyframe.cloud_camera for keyframe in keyframes],
         [keyframe.T_world_camera for keyframe in keyframes],
         config.voxel_size_m,
         config.max_points,
     )
+    # Thin things that the reference missed would go too, so only where something moves.
+    has_moving = any((k.observations.landmark_ids == MOVING).any() for k in keyframes)
+    return _still_there(merged, keyframes[0]) if has_moving else merged
+
+
+def _still_there(cloud_world: PointCloud, reference: StoredKeyframe) -> PointCloud:
+    """The cloud without what the reference looked through: what stood there has gone."""
+    free = seen_through(reference.cloud_camera.points, np.eye(4))
+    verdicts = free.verdicts(cloud_world.points, inverse(reference.T_world_camera))
+    stays = verdicts <= 0
+    return PointCloud(cloud_world.points[stays], cloud_world.normals[stays])
 
 
 def _context_landmark_ids(
@@ -275,8 +288,9 @@ def _window(
 
 
 def _observations_of(observations: Observations, ids: NDArray[np.int64]) -> Observations:
-    """Those of the given landmarks only; ids ascend."""
-    _, rows = _rows_of(ids, observations.landmark_ids)
+    """Those of the given landmarks, whose ids ascend, and of what moves."""
+    _, known = _rows_of(ids, observations.landmark_ids)
+    rows = np.concatenate([known, np.flatnonzero(observations.landmark_ids == MOVING)])
     return Observations(
         landmark_ids=observations.landmark_ids[rows],
         keypoints_px=observations.keypoints_px[rows],
