@@ -35,15 +35,16 @@ def measure_http(sequence: FileSequence, frames: int, seconds: float) -> dict[st
 
 
 def _refined_and_rendered(session: Session, seconds: float) -> dict[str, Any]:
-    views = _novel_views([T for _, T in session.poses()])
+    views = novel_views(session)
     before = session.info()["iterations"]
     times_ms = asked(lambda i: session.render(views[i % len(views)]), seconds)
     done = session.info()["iterations"] - before
     return spread("http_new_view", times_ms) | {"http_iterations_per_s": done / seconds}
 
 
-def _novel_views(T_world_cameras: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-    """No two alike, so that none comes from the cache."""
+def novel_views(session: Session) -> list[NDArray[np.float64]]:
+    """Poses off the camera's path, no two alike, so that none comes from the cache."""
+    T_world_cameras = [T for _, T in session.poses()]
     rng = np.random.default_rng(0)
     poses = [T_world_cameras[i % len(T_world_cameras)] for i in range(1000)]
     return [pose @ se3.exp(rng.normal(0, _OFF_PATH)) for pose in poses]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from shared.errors import ConfigError, PointSlamError
 
-NAMES = ("rasterizer", "tracking", "mapping", "renders", "gateway", "failover", "fuzz")
+NAMES = ("rasterizer", "tracking", "mapping", "renders", "gateway", "console", "failover", "fuzz")
 _FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
 
