@@ -38,6 +38,11 @@ class Cluster:
         os.kill(victim.pid, signal.SIGKILL)
         victim.wait(10.0)
 
+    def end(self, name: str) -> int:
+        """Ask a process to end, as a deploy does; its exit code."""
+        self._processes[name].terminate()
+        return self._processes[name].wait(30.0)
+
     def freeze(self, name: str) -> None:
         """Let a process live and do nothing."""
         os.kill(self._processes[name].pid, signal.SIGSTOP)

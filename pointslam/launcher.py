@@ -140,15 +140,14 @@ class Services:
         return dict(total)
 
     def stop(self) -> None:
-        """End all processes, the router last."""
-        for process in reversed(self._processes[1:]):
-            process.terminate()
+        """End all processes: gateways while what they ask still answers, the router last."""
         deadline = time.monotonic() + _STOP_TIMEOUT_S
-        for process in self._processes[1:]:
-            process.wait(max(deadline - time.monotonic(), 0.1))
-        for process in self._processes[:1]:
-            process.terminate()
-            process.wait(5.0)
+        for roles in (("gateway",), ("tracking", "mapping"), ("router",)):
+            ending = [each for each in self._processes if each.command.role in roles]
+            for process in ending:
+                process.terminate()
+            for process in ending:
+                process.wait(max(deadline - time.monotonic(), 5.0))
         self._processes.clear()
 
     def _start(self, command: Command, logs: Path) -> ServiceProcess:

@@ -109,13 +109,13 @@ class ServiceProcess:
         if self.is_running():
             self._process.send_signal(signal.SIGTERM)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait for its end, and enforce it when the time is over."""
+    def wait(self, timeout_s: float) -> int:
+        """Wait for its end, and enforce it when the time is over; its exit code."""
         try:
-            self._process.wait(timeout_s)
+            return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
+            return self._process.wait()
 
     def _lines(self) -> list[str]:
         return self.log.read_text(errors="replace").splitlines()

@@ -89,7 +89,7 @@ async def _serve(
     server = _Server(_uvicorn_config(create_app(sessions, door.authority), config, door.tls))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, _drain, sessions, server)
+        loop.add_signal_handler(number, _drain, sessions, server, config.drain_notice_s)
     try:
         async with serve_grpc(sessions, door):
             await server.serve([listener])
@@ -98,10 +98,14 @@ async def _serve(
         await sessions.close()
 
 
-def _drain(sessions: Sessions, server: _Server) -> None:
+def _drain(sessions: Sessions, server: _Server, notice_s: float) -> None:
     """Be ready no longer, then close the door and finish what is under way."""
-    sessions.is_draining = True
-    server.should_exit = True
+    sessions.drain()
+
+    def close_door() -> None:
+        server.should_exit = True
+
+    asyncio.get_running_loop().call_later(notice_s, close_door)
 
 
 def _uvicorn_config(app: FastAPI, config: GatewayConfig, tls: Tls | None) -> uvicorn.Config:
@@ -118,7 +122,7 @@ def _uvicorn_config(app: FastAPI, config: GatewayConfig, tls: Tls | None) -> uvi
         ws_ping_interval=config.stream.ping_interval_s,
         ws_ping_timeout=config.stream.ping_timeout_s,
         limit_concurrency=config.limits.max_connections,
-        timeout_graceful_shutdown=int(config.drain_s),
+        timeout_graceful_shutdown=max(1, round(config.drain_s)),
     )
 
 

@@ -146,4 +146,5 @@ class GatewayConfig:
     bus: BusConfig = field(default_factory=BusConfig)
     session_idle_s: float = 600.0  # a session that nobody uses for so long is forgotten here
     path_keep_s: float = 600.0  # the file of a path render may be fetched for so long
-    drain_s: float = 10.0  # time to finish what is in flight at SIGTERM
+    drain_notice_s: float = 0.5  # at SIGTERM: not ready for so long before the door closes,
+    drain_s: float = 4.0  # then so long for requests under way, and for what maps have not logged

@@ -35,7 +35,7 @@ from shared.wire import (
 )
 
 _READINESS_S = 0.5
-_GRACE_S = 3.0
+_GRACE_S = 1.0
 _NAMES = [
     module.DESCRIPTOR.services_by_name[name].full_name
     for module, name in (

@@ -155,6 +155,8 @@ class PoseService(pose_service_pb2_grpc.PoseServiceServicer):
             with watched(session) as poses:
                 await context.send_initial_metadata(())  # from here on no pose is missed
                 async for news in follow(session, poses, look_every_s):
+                    if not self._sessions.is_serving(session):
+                        return
                     if news is not None:
                         pose = timed_pose_to(news.pose, news.T_map_odom)
                         yield pose_service_pb2.WatchPosesResponse(

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -50,6 +50,7 @@ class Fabric:
     mappers: Members
     config: GatewayConfig
     name: str = "gateway"
+    ending: asyncio.Event = field(default_factory=asyncio.Event)  # nobody waits for a mapper now
 
 
 class MapOwner:
@@ -153,7 +154,7 @@ class MapOwner:
                 if await self._is_back() or await self._open_anywhere():
                     self.lost.clear()
                     return
-                if time.monotonic() > deadline:
+                if time.monotonic() > deadline or self._fabric.ending.is_set():
                     raise UnavailableError(f"no mapper has session {self.session} at present")
 
     async def _is_back(self) -> bool:

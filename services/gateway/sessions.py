@@ -70,7 +70,6 @@ class Sessions:
     """
 
     fabric: Fabric
-    is_draining: bool = False  # this process is ending
     _open: dict[str, Session] = field(default_factory=dict)
     # One lock a name, for as long as somebody opens it: no session waits for another's map.
     _opening: WeakValueDictionary[str, asyncio.Lock] = field(default_factory=WeakValueDictionary)
@@ -132,6 +131,15 @@ class Sessions:
             for name, session in list(self._open.items()):
                 if session.is_idle(idle_s):
                     self._open.pop(name).close()
+
+    def drain(self) -> None:
+        """Be ready no longer, and let nothing that is asked wait for a mapper: we are ending."""
+        self.fabric.ending.set()
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether this process is ending."""
+        return self.fabric.ending.is_set()
 
     def is_serving(self, session: Session) -> bool:
         """Whether a session that was got is still served here."""

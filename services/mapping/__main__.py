@@ -66,6 +66,7 @@ def main(argv: list[str]) -> None:
         host.start()
         announce_ready(arguments.id)
         stop.wait()
+        bus.withdraw()  # gateways look for others while the sessions are saved
         host.close()
 
 

@@ -197,7 +197,8 @@ class OwnerConfig:
     max_pending_live: int = 100
     snapshot_interval_s: float = 180.0
     live_idle_s: float = 60.0  # live: optimise for so long after the last entry
-    session_idle_s: float = 600.0  # a session that nobody asks for so long goes to disk
+    session_idle_s: float = 600.0  # a session that nobody asks for so long goes to disk,
+    yield_idle_s: float = 15.0  # and after so long already where another one needs its place
     chunk_bytes: int = 4 << 20
     lease_s: float = 5.0  # a frozen owner's sessions are free to others after so long
     lease_store: str = ""  # SQLite beside the sessions, or postgresql://user@host/name
@@ -209,6 +210,7 @@ class OwnerConfig:
         _check(self.max_pending > 0, "owner.max_pending must be positive")
         _check(self.max_pending_live > 0, "owner.max_pending_live must be positive")
         _check(self.session_idle_s > 0, "owner.session_idle_s must be positive")
+        _check(self.yield_idle_s >= 0, "owner.yield_idle_s must not be negative")
         _check(self.lease_s >= 0.5, f"owner.lease_s must be at least 0.5, got {self.lease_s}")
         _check(self.max_sessions > 0, "owner.max_sessions must be positive")
         _check(self.chunk_bytes > 0, "owner.chunk_bytes must be positive")

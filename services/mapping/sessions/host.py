@@ -67,6 +67,7 @@ class MapperHost:
         self._bus = bus
         self._settings = settings
         self._lock = threading.Lock()
+        self._is_closing = False
         self._served: dict[str, Served] = {}
         self._queries = ThreadPoolExecutor(_QUERY_THREADS, thread_name_prefix="query")
         lower = (give_way, (settings.config.owner.niceness,))
@@ -160,6 +161,7 @@ class MapperHost:
     def close(self) -> None:
         """Withdraw every session, with a snapshot of each."""
         self._janitor.stop()
+        self._is_closing = True
         with self._lock:
             for name in list(self._served):
                 self._put_away(name)
@@ -227,8 +229,7 @@ class MapperHost:
 
     def _serve(self, request: OpenRequest) -> Served:
         settings = self._settings
-        if len(self._served) >= settings.config.owner.max_sessions:
-            raise UnavailableError(f"mapper {settings.name} has {len(self._served)} sessions open")
+        self._make_room()
         surroundings = Surroundings(
             settings.name, settings.config, settings.device, self._bus.publish
         )
@@ -254,6 +255,29 @@ class MapperHost:
             session.ledger.num_keyframes,
         )
         return served
+
+    def _make_room(self) -> None:
+        """Put the session away that rests longest, where there is no room for one more.
+
+        Raises:
+            UnavailableError: all of them are in use, or this process is ending.
+        """
+        owner, name = self._settings.config.owner, self._settings.name
+        if self._is_closing:
+            raise UnavailableError(f"mapper {name} is ending")
+        if len(self._served) < owner.max_sessions:
+            return
+        before_s = time.monotonic() - owner.yield_idle_s
+        resting = [
+            (served.used_s, session)
+            for session, served in self._served.items()
+            if served.used_s < before_s and not served.session.is_working
+        ]
+        if not resting:
+            raise UnavailableError(f"mapper {name} has {len(self._served)} sessions in use")
+        _, session = min(resting)
+        self._put_away(session)
+        LOGGER.info("%s: idle, put away to make room", session)
 
     def _summary(self, folder: Path) -> SessionSummary | None:
         """None for a damaged session: it must not hide the others."""
