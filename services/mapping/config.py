@@ -33,6 +33,8 @@ class AnchorConfig:
     primary_rate: float = 0.5  # of the secondary anchors' learning rate; 0.1 costs 0.2 to 0.3 dB
     young_boost: float = 4.0  # a new anchor learns (1 + young_boost exp(-t / young_steps)) times
     young_steps: float = 10.0  # as fast at its step t: it may have few, or many to settle in
+    fusion_steps: float = 5.0  # an anchor that has learned for so many steps takes over half of
+    # what a new keyframe sees differently, a younger one more; 0: none does
     min_alpha: float = 0.5  # a pixel below this is not covered by the map
     min_depth_gap_m: float = 0.03  # measured depth this much in front, and by this share,
     min_depth_gap: float = 0.06  # is not covered
@@ -52,6 +54,7 @@ class AnchorConfig:
         _check(self.max_anchors > 0, "anchors.max_anchors must be positive")
         _check(self.young_boost >= 0, "anchors.young_boost must not be negative")
         _check(self.young_steps > 0, "anchors.young_steps must be positive")
+        _check(self.fusion_steps >= 0, "anchors.fusion_steps must not be negative")
         _check(self.carve_window_px % 2 == 1, "anchors.carve_window_px must be odd")
         _check(0 < self.initial_opacity < 1, "anchors.initial_opacity must be between 0 and 1")
 
@@ -103,6 +106,24 @@ class RefinementConfig:
     def at(self, progress: float) -> LearningRates:
         """The rates at 0 <= `progress` < 1 of a refinement."""
         return self.rates.scaled(self.decay**progress)
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """The exposure that a new keyframe starts with: the one before it, or fitted to the map."""
+
+    min_overlap: float = 0.1  # of the pixels; with less, the one before it
+    min_alpha: float = 0.9
+    pixel_step: int = 6  # every so many pixels of a row and column, at half the size
+    gain_inertia: float = 0.01  # weight of the gain before it, in all the pixels' weight
+    bias_inertia: float = 0.5
+    min_improvement: float = 0.05  # of the residuals' cost, for another exposure to be taken
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.min_overlap <= 1, "exposure.min_overlap must be 0 to 1")
+        _check(self.pixel_step > 0, "exposure.pixel_step must be positive")
+        is_fine = self.gain_inertia > 0 and self.bias_inertia > 0
+        _check(is_fine, "exposure.gain_inertia and bias_inertia must be positive")
 
 
 @dataclass(frozen=True)
@@ -241,6 +262,7 @@ class MappingConfig:
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     rates: LearningRates = field(default_factory=LearningRates)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)

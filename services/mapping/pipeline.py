@@ -27,16 +27,13 @@ from services.mapping.decoding.environment import Environment
 from services.mapping.decoding.optimizer import Youth, adam_rows, begin_step
 from services.mapping.losses.cpu import mapping_loss_cpu
 from services.mapping.losses.mapping_loss import Appearance, Target, mapping_loss
-from services.mapping.map_state import (
-    MapState,
-    as_arrays,
-    as_tensors,
-    flatten,
-    unflatten,
-)
+from services.mapping.map_state import MapState, as_arrays, as_tensors, flatten, unflatten
 from services.mapping.rasterizer import View, rasterizer_for
 from services.mapping.views.appearance import ExposureModel
+from services.mapping.views.colour_fusion import fuse_colours
 from services.mapping.views.coverage import uncovered_pixels
+from services.mapping.views.exposure_fit import fitted_exposure
+from services.mapping.views.first_look import first_look, resized
 from services.mapping.views.render import Drawn, Painter, to_images
 from services.mapping.views.render_cache import Moment
 from services.mapping.views.sightings import Sightings
@@ -126,8 +123,9 @@ class Mapper:
             image = self._add_view(keyframe)
             pose, config = keyframe.T_world_camera, self.config.anchors
             carve(self.anchors, image, pose, config)
-            is_uncovered = uncovered_pixels(self.painter, image, pose, config)
-            request = SeedRequest(image, pose, is_uncovered, keyframe.landmarks_world)
+            is_uncovered = self._look_at(keyframe, image)
+            landmarks, exposure = keyframe.landmarks_world, self.exposures.of(keyframe.frame.seq)
+            request = SeedRequest(image, pose, is_uncovered, landmarks, exposure)
             new = seed_anchors(request, self.anchors.keys(), config, self._rng)
             self.revision = keyframe.poses.revision
             added = self.anchors.append(new, keyframe.frame.seq)
@@ -279,6 +277,20 @@ class Mapper:
         mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
         self._background += (mean - self._background) / len(self.views)
         return image
+
+    def _look_at(self, keyframe: NewKeyframe, image: RgbdImage) -> NDArray[np.bool_]:
+        """Take over a keyframe's exposure and colours; returns what the map lacks, [H, W]."""
+        if len(self.anchors) == 0:
+            return np.ones(image.depth_m.shape, bool)
+        seq, config = keyframe.frame.seq, self.config.anchors
+        look = first_look(self.painter, image, keyframe.T_world_camera)
+        is_uncovered = uncovered_pixels(look, config)
+        fitted = fitted_exposure(look, self.exposures.of(seq), self.config.exposure)
+        if fitted is not None:
+            self.exposures.set(seq, fitted)
+            appearance = self._appearance(torch.from_numpy(fitted).to(self._device))
+            fuse_colours(self.anchors, look, ~is_uncovered, appearance, config.fusion_steps)
+        return resized(is_uncovered, *image.depth_m.shape)
 
     def _appearance(self, exposure: Tensor) -> Appearance:
         background = torch.from_numpy(self._background.copy())

@@ -15,6 +15,7 @@ from services.mapping.config import AnchorConfig, MappingConfig
 from services.mapping.decoding.decoders import NeuralDecoder, decoder_for
 from services.mapping.rasterizer import Gaussians
 from services.mapping.rasterizer.reference import rotations
+from services.mapping.views.appearance import IDENTITY
 from services.mapping.views.coverage import uncovered
 from shared import se3
 from shared.camera import Intrinsics
@@ -45,7 +46,7 @@ def wall(colour: tuple[int, int, int] = (200, 100, 50), depth_m: float = 2.0) ->
 def seeded(image: RgbdImage, landmarks: np.ndarray | None = None, taken=(), mask=True):
     is_uncovered = np.full(image.depth_m.shape, mask)
     points = np.zeros((0, 3)) if landmarks is None else landmarks
-    request = SeedRequest(image, np.eye(4), is_uncovered, points)
+    request = SeedRequest(image, np.eye(4), is_uncovered, points, IDENTITY)
     keys = np.array(taken, np.int64)
     return seed_anchors(request, keys, CONFIG, np.random.default_rng(0))
 

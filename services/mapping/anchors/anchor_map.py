@@ -99,6 +99,11 @@ class AnchorMap:
             return sizes
         return sizes + self.rows["sizes"][index].view(-1, self.config.children, 3).mean(1)
 
+    def add_to_logit_colours(self, index: Tensor, change: Tensor) -> None:
+        """Add `change` [V, k * 3] to the logits that the colours of the children start from."""
+        name = "colours" if self.config.gaussians == "plain" else "features"
+        self.rows[name][index, : change.shape[1]] += change
+
     def append(self, new: NewAnchors, creator_seq: int) -> int:
         """Add anchors that keyframe `creator_seq` made, up to the cap; returns how many.
 

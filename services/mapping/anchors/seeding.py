@@ -32,6 +32,7 @@ class SeedRequest:
     T_world_camera: NDArray[np.float64]  # [4, 4]
     is_uncovered: NDArray[np.bool_]  # [H, W], pixels that the map does not explain
     landmarks_world: NDArray[np.float64]  # [L, 3], ORB points of the keyframe
+    exposure: NDArray[np.float32]  # [2, 3], gain and bias: anchors keep colours without it
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,7 @@ def _span(
 def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generator) -> _Samples:
     """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
     image, camera = request.image, request.image.intrinsics
+    gain, bias = request.exposure
     depth_m = filled_depth(image.depth_m) if config.fill_holes else image.depth_m
     landmarks = _LandmarkVoxels.of(request, config)
     is_candidate = request.is_uncovered | landmarks.pixels(camera)
@@ -149,7 +151,7 @@ def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generato
     return _Samples(
         keys=keys[wanted],
         points_world=points[wanted].astype(np.float32),
-        colours=image.rgb[rows[wanted], columns[wanted]].astype(np.float32) / 255.0,
+        colours=(image.rgb[rows[wanted], columns[wanted]] / np.float32(255.0) - bias) / gain,
         depths=depths[wanted],
         levels=levels[wanted],
         is_landmark=is_landmark[wanted],

@@ -32,6 +32,11 @@ class ExposureModel:
         self._times[seq] = t_ns
         self._steps[seq] = 0
 
+    def set(self, seq: int, exposure: NDArray[np.float32]) -> None:
+        """Replace the exposure [2, 3] of a keyframe that has not been trained on, not the first."""
+        if seq != next(iter(self._rows)):
+            self._rows[seq][0] = exposure
+
     def of(self, seq: int) -> NDArray[np.float32]:
         """Exposure of a keyframe, [2, 3]."""
         return self._rows[seq][0].copy()

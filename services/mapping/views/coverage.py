@@ -6,35 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.config import AnchorConfig
-from services.mapping.rasterizer import View
-from services.mapping.views.render import Painter
-from shared import se3
-from shared.rectify import RgbdImage
+from services.mapping.views.first_look import FirstLook
 
 
-def uncovered_pixels(
-    painter: Painter,
-    image: RgbdImage,
-    T_world_camera: NDArray[np.float64],
-    config: AnchorConfig,
-) -> NDArray[np.bool_]:
-    """Pixels that the map leaves open or draws behind the measured surface, [H, W].
+def uncovered_pixels(look: FirstLook, config: AnchorConfig) -> NDArray[np.bool_]:
+    """Pixels of a look that the map leaves open or draws behind the measured surface, [H, W].
 
-    Judged on a render of half the size: "new Gaussian points are only added to non-overlapping
-    regions of the new keyframe".
+    "New Gaussian points are only added to non-overlapping regions of the new keyframe".
     """
-    height, width = image.depth_m.shape
-    if len(painter.anchors) == 0:
-        return np.ones((height, width), bool)
-    half = image.intrinsics.scaled(0.5)
-    rendered = painter.draw(View(se3.inverse(T_world_camera), half)).rendered
-    is_uncovered = uncovered(
-        rendered.alpha.cpu().numpy(),
-        rendered.depth.cpu().numpy(),
-        _resized(image.depth_m, half.height, half.width),
-        config,
-    )
-    return _resized(is_uncovered, height, width)
+    alpha, depth_sum = look.rendered.alpha.detach(), look.rendered.depth.detach()
+    return uncovered(alpha.cpu().numpy(), depth_sum.cpu().numpy(), look.depth_m, config)
 
 
 def uncovered(
@@ -52,10 +33,3 @@ def uncovered(
     is_open = alpha < config.min_alpha
     limit = measured_m * (1.0 + config.min_depth_gap) + config.min_depth_gap_m
     return is_open | ((measured_m > 0) & (depth_sum > limit * np.maximum(alpha, 1e-6)))
-
-
-def _resized(image: NDArray, height: int, width: int) -> NDArray:
-    """The image at another size, nearest pixels."""
-    rows = (2 * np.arange(height) + 1) * image.shape[0] // (2 * height)
-    columns = (2 * np.arange(width) + 1) * image.shape[1] // (2 * width)
-    return image[rows[:, None], columns]
