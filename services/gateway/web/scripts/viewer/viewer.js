@@ -11,6 +11,7 @@ import { Split } from "./split.js";
 const FIELD_OF_VIEW = (50 * Math.PI) / 180;
 const MAX_WIDTH_PX = 640; // of an exact view; it is drawn on the server's processor
 const FOLLOW_EVERY_MS = 400;
+const PATIENCE_MS = 2000;
 const PREVIEW_EVERY_MS = 8000;
 const SLOW_MS = 130; // while the eye moves, views that take longer are drawn at half their size
 const MODE_KEYS = { 1: "splats", 2: "split", 3: "exact" };
@@ -41,6 +42,7 @@ export class Viewer {
       settled: () => this.askExact(false),
     });
     if (this.pose) this.orbit.lookThrough(this.pose);
+    await this.firstPicture();
     try {
       const { Splats } = await import("./splats.js");
       this.splats = new Splats(byId("scene"), this.orbit.camera);
@@ -49,6 +51,15 @@ export class Viewer {
       this.noSplats();
     }
     this.resize();
+  }
+
+  /** Starting WebGL may hold the page up for seconds: the server's first picture goes before it. */
+  firstPicture() {
+    return new Promise((done) => {
+      if (this.stage.dataset.exact) done();
+      this.pictureCame = done;
+      setTimeout(done, PATIENCE_MS);
+    });
   }
 
   /** Without WebGL the exact view is all there is, and enough. */
@@ -193,6 +204,7 @@ export class Viewer {
   hearExact(about) {
     if (about.error) { this.note(about.error.reason); return; }
     this.note("");
+    this.pictureCame?.();
     this.renderMs = about.render_ms;
     this.stage.dataset.exact = about.state;
     this.stage.dataset.pictures = Number(this.stage.dataset.pictures ?? 0) + 1;
