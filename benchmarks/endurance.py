@@ -28,7 +28,7 @@ from services.gateway.prior import next_prior
 from services.mapping.keyframes.store import KeyframeStore
 from shared.bus import Bus, Keys, open_bus, open_router
 from shared.frames import Prior, TrackRequest
-from shared.tracks import CandidatesRequest, ContextRequest, TrackResult
+from shared.tracks import CandidatesRequest, ContextRequest, TrackingContext, TrackResult
 
 _SESSION = "endurance"
 _PERIOD_NS = 33_000_000
@@ -108,9 +108,14 @@ def _serve(bus: Bus, store: KeyframeStore) -> None:
     bus.serve(
         Keys.session(_SESSION, 1, "context"),
         ContextRequest,
-        lambda request: store.context(request.reference_seq),
+        lambda request: _context(store, request),
     )
     bus.serve(Keys.session(_SESSION, 1, "candidates"), CandidatesRequest, store.candidates)
+
+
+def _context(store: KeyframeStore, request: ContextRequest) -> TrackingContext:
+    ask = store.loop_context if request.is_near_only else store.context
+    return ask(request.reference_seq)
 
 
 def _track(
@@ -122,6 +127,7 @@ def _track(
     result = bus.query(Keys.track(_SESSION), request, TrackResult, 30.0)
     if result.keyframe is not None:
         store.insert(seq, result.t_ns, result.T_world_camera, result.keyframe)
+        store.context(seq)  # ahead, as a map's owner does; the first time its kernels are compiled
     return next_prior(prior, frame, result)
 
 
