@@ -33,8 +33,9 @@ check: .venv/.ready
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
+# A file's tests stay in one process: they share the services that it starts.
 test: check
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 clean:
 	rm -rf .venv demo
