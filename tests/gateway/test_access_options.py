@@ -5,8 +5,10 @@ import base64
 import datetime
 import hmac
 import json
+import sqlite3
 import time
 from ipaddress import ip_address
+from pathlib import Path
 
 import grpc
 import httpx
@@ -26,7 +28,7 @@ from services.gateway.access.identity import JwtVerifier
 from services.gateway.access.rates import TokenBucket
 from services.gateway.access.routes import ADMIN, POSE
 from services.gateway.config import AccessConfig, JwtConfig
-from shared.api_keys import KeyStore, NewKey, Scope
+from shared.api_keys import KeyStore, NewKey, Scope, key_id
 from shared.errors import ConfigError, ForbiddenError, UnauthenticatedError
 
 ISSUER, AUDIENCE = "https://id.example", "pointslam"
@@ -65,6 +67,22 @@ def test_keys_may_be_asked_for_on_every_address(store):
     authority = authority_from(options("--keys", store, "--http-host", "0.0.0.0"), AccessConfig())
 
     assert not authority.is_local
+
+
+def test_a_stream_goes_on_while_the_store_of_its_key_is_locked_and_ends_when_it_is_revoked(store):
+    writer = KeyStore.open(Path(store))
+    text = writer.create(NewKey())
+    authority = authority_from(options("--keys", store), AccessConfig())
+    caller = authority.admit(Shown(f"Bearer {text}"), POSE)
+    lock = sqlite3.connect(store, isolation_level=None)
+    lock.execute("BEGIN EXCLUSIVE")
+
+    while_locked = authority.has_ended(caller)
+    lock.execute("ROLLBACK")
+    writer.revoke(str(key_id(text)))
+
+    assert not while_locked
+    assert authority.has_ended(caller)
 
 
 def test_half_a_certificate_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -12,7 +13,9 @@ from services.gateway.access.routes import Access
 from services.gateway.access.tickets import Tickets
 from services.gateway.config import AccessConfig
 from shared.api_keys import PREFIX
-from shared.errors import ForbiddenError, UnauthenticatedError
+from shared.errors import ForbiddenError, StorageError, UnauthenticatedError
+
+LOGGER = logging.getLogger(__name__)
 
 KEYS, JWT = "keys", "jwt"
 _LOCAL = Caller("local")
@@ -64,6 +67,17 @@ class Authority:
             return True
         identity = Identity(caller.id, caller.tenant, caller.scopes, caller.expires_s)
         return self._verifier_of(caller.id).is_valid(identity)
+
+    def has_ended(self, caller: Caller) -> bool:
+        """Whether the key of an open stream has ended, as far as can be told now.
+
+        A store that is busy is asked again next time: an error would end who looks, not the stream.
+        """
+        try:
+            return not self.is_valid(caller)
+        except StorageError as error:
+            LOGGER.warning("whether %s may go on is asked again: %s", caller.id, error)
+            return False
 
     def _identified(self, shown: Shown, access: Access) -> Caller:
         if self.is_local:

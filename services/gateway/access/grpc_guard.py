@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 from services.gateway.access import audit
 from services.gateway.access.authority import Authority, Shown
 from services.gateway.access.caller import CALLER, Caller
+from services.gateway.access.grpc_context import SharedContext
 from services.gateway.access.routes import ADMIN, ANY, GRPC, OPEN, Access
 from services.gateway.errors import MESSAGE
 from services.gateway.grpc_errors import refusing
@@ -65,7 +66,8 @@ class _Guarded:
         return make(guarded, None, handler.response_serializer)
 
     def _call(self, behaviour: Any) -> Callable[[Any, Any], Awaitable[Any]]:
-        async def call(request: Any, context: Any) -> Any:
+        async def call(request: Any, served: Any) -> Any:
+            context = SharedContext(served)
             caller = await self._admit(context)
             outcome = "OK"
             try:
@@ -81,10 +83,12 @@ class _Guarded:
         return call
 
     def _stream(self, behaviour: Any) -> Callable[[Any, Any], AsyncIterator[Any]]:
-        async def stream(request: Any, context: Any) -> AsyncIterator[Any]:
+        async def stream(request: Any, served: Any) -> AsyncIterator[Any]:
+            context = SharedContext(served)
             caller = await self._admit(context)
             async with refusing(context), self._while_valid(caller, context):
                 async for response in behaviour(request, context):
+                    await context.open()
                     yield response
 
         return stream

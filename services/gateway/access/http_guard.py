@@ -86,7 +86,7 @@ class HttpGuard:
         serving = asyncio.ensure_future(self._app(scope, receive, send))
         try:
             while not (await asyncio.wait({serving}, timeout=self._authority.config.recheck_s))[0]:
-                if not self._authority.is_valid(caller):
+                if self._authority.has_ended(caller):
                     await _cut(scope, send)
                     return
             serving.result()
