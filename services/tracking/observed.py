@@ -51,6 +51,7 @@ class Observed:
     appearance: Future[Appearance]
     config: TrackingConfig
     moving: Features = field(default_factory=no_features)  # of what moves, left out above
+    is_moving: NDArray[np.bool_] | None = None  # [H, W], its pixels; None: nothing moves
 
     @cached_property
     def image(self) -> RgbdImage:
@@ -82,18 +83,20 @@ class Observed:
         pixels = np.floor(points[:, :2] / points[:, 2:] * [i.fx, i.fy] + [i.cx + 0.5, i.cy + 0.5])
         u, v = pixels.astype(np.int64).clip(0, [i.width - 1, i.height - 1]).T
         stays = ~moving[v, u]
+        is_moving = moving if self.is_moving is None else moving | self.is_moving
         pixels = self.features.keypoints_px.astype(np.int64)
         on_it = np.flatnonzero(moving[pixels[:, 1], pixels[:, 0]] & (self.features.depths_m > 0.0))
         appearance: Future[Appearance] = Future()
         rgb = self.appearance.result().rgb
-        appearance.set_result(Appearance(rgb, detect(rgb, self.config.orb, ~moving)))
+        appearance.set_result(Appearance(rgb, detect(rgb, self.config.orb, ~is_moving)))
         return Observed(
             depth_m=np.where(moving, np.float32(0.0), self.depth_m),
             intrinsics=i,
             cloud=PointCloud(points[stays], self.cloud.normals[stays]),
             appearance=appearance,
             config=self.config,
-            moving=self.features.rows(on_it),
+            moving=self.moving.joined(self.features.rows(on_it)),
+            is_moving=is_moving,
         )
 
     def wait(self) -> None:

@@ -46,6 +46,15 @@ class Features:
             self.keypoints_px[rows], self.octaves[rows], self.descriptors[rows], self.depths_m[rows]
         )
 
+    def joined(self, others: Features) -> Features:
+        """These, then the others."""
+        return Features(
+            np.concatenate([self.keypoints_px, others.keypoints_px]),
+            np.concatenate([self.octaves, others.octaves]),
+            np.concatenate([self.descriptors, others.descriptors]),
+            np.concatenate([self.depths_m, others.depths_m]),
+        )
+
 
 def backproject(
     keypoints_px: NDArray[np.float32], depths_m: NDArray[np.float32], intrinsics: Intrinsics

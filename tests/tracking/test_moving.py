@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks.disturbances import CarriedPlane, MovingBox
-from services.tracking.config import MovingConfig
+from services.tracking.config import MovingConfig, TrackingConfig
+from services.tracking.executors import NoHelper
+from services.tracking.observed import EncodedImages, observe
+from services.tracking.stopwatch import Stopwatch
 from services.tracking.surfaces import surfaces_of
 from shared.frames import TrackingStatus
 from shared.free_space import seen_through
@@ -119,6 +122,23 @@ def test_surfaces_part_where_the_depth_jumps():
     assert surfaces.median_m(chosen) == 1.0
     mask = surfaces.mask(chosen, depth_m.shape)
     assert mask[8:40, 16:48].all() and not mask[:, :8].any()
+
+
+def test_what_is_left_out_second_leaves_out_the_first_as_well(room):
+    frame = room.frame(0, CORNER)
+    images = EncodedImages(frame.rgb, frame.depth, room.calibration)
+    observed = observe(images, TrackingConfig(), Stopwatch(), NoHelper())
+    left, right = np.zeros((2, *observed.depth_m.shape), bool)
+    left[:, :80], right[:, -80:] = True, True
+
+    once = observed.without(left)
+    both = once.without(right)
+
+    first = len(once.moving.octaves)
+    assert 0 < first < len(both.moving.octaves)
+    np.testing.assert_array_equal(both.moving.keypoints_px[:first], once.moving.keypoints_px)
+    u = both.features.keypoints_px[:, 0].astype(int)
+    assert ((u >= 80) & (u < left.shape[1] - 80)).all()
 
 
 def wall(z_m: float) -> np.ndarray:
