@@ -14,6 +14,7 @@ pytestmark = pytest.mark.system
 def page(browser, pictures):
     with local_gateway(1) as gateway:
         browser.resize(1280, 900)
+        browser.forget()
         browser.open(f"{gateway.url}/docs")
         browser.wait_for("location.pathname === '/docs' && document.body?.dataset.ready === 'true'")
         browser.wait_for("document.querySelectorAll('.opblock').length > 0")

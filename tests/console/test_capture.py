@@ -23,6 +23,7 @@ def gateway(browser):
     with local_gateway(1) as running, Client(running.url) as client:
         while not client.ready():
             pass
+        browser.forget()
         yield running
         browser.forget()
 
