@@ -108,5 +108,7 @@ def streaming(cluster, recording, undisturbed, request):
 def assert_nothing_lost(cluster: Cluster, name: str, heard: Heard, undisturbed) -> None:
     after = aftermath(cluster.url, name, heard, undisturbed)
     assert (after.lost, after.refused, after.missing) == ([], [], []), name
-    # Which neighbourhood a live frame is tracked in depends on when a keyframe arrives.
-    assert after.difference_m < (0.01 if name.endswith("live") else 0.001), name
+    # Which neighbourhood a live frame is tracked in depends on when a keyframe arrives; where
+    # frames were superseded the others are tracked over larger steps, from other keyframes.
+    limit_m = (0.1 if heard.superseded() else 0.01) if name.endswith("live") else 0.001
+    assert after.difference_m < limit_m, name
