@@ -39,7 +39,9 @@ class SharedContext:
         await self.open()
         await self._context.write(message)
 
-    async def abort(self, code: grpc.StatusCode, details: str = "") -> None:
-        """End the call with a status; raises grpc.aio.AbortError."""
+    async def abort(
+        self, code: grpc.StatusCode, details: str = "", trailing: tuple[tuple[str, str], ...] = ()
+    ) -> None:
+        """End the call with a status and trailing metadata; raises grpc.aio.AbortError."""
         async with self._sending:
-            await self._context.abort(code, details)
+            await self._context.abort(code, details, trailing)
