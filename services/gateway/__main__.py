@@ -35,8 +35,6 @@ from shared.service import (
 )
 from shared.tracing import setup_tracing
 
-_UNREAD_MS = 30_000
-
 
 class _Server(uvicorn.Server):
     """uvicorn without its own signal handling, which would end the process by the signal."""
@@ -64,20 +62,20 @@ def main(argv: list[str]) -> None:
     config = settings_from(arguments, GatewayConfig())
     authority, tls = authority_from(arguments, config.access), tls_from(arguments)
     door = GrpcDoor(arguments.http_host, arguments.grpc_port, authority, tls)
-    listener = _listen(arguments.http_host, arguments.http_port)
+    listener = _listen(arguments.http_host, arguments.http_port, config.stream.unread_s)
     with listener, open_bus(endpoints(arguments), config.bus) as bus:
         loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
         with asyncio.Runner(loop_factory=loop_factory) as runner:
             runner.run(_serve(bus, config, listener, door, arguments.id))
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int, unread_s: float) -> socket.socket:
     try:
         listener = socket.create_server((host, port), backlog=512)
     except OSError as error:
         raise UnavailableError(f"cannot listen on {host}:{port}: {error}") from None
-    # Connections inherit it: the kernel drops a client that acknowledges nothing for so long.
-    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
+    # Connections inherit it.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1e3 * unread_s))
     return listener
 
 

@@ -92,7 +92,8 @@ class StreamConfig:
 
     credit: int = 2  # frames in flight and waiting: one each
     live_unanswered: int = 64  # of a live stream; superseded ones are answered in order
-    send_timeout_s: float = 5.0  # a client that does not read for so long is cut off
+    send_timeout_s: float = 5.0  # a client that does not read for so long is cut off,
+    unread_s: float = 30.0  # and the kernel drops what it has not taken by then
     ping_interval_s: float = 30.0
     event_interval_s: float = 0.25  # between looks at a refinement that somebody watches
     live_interval_s: float = 0.1  # between looks at a session that somebody watches
@@ -102,7 +103,8 @@ class StreamConfig:
     max_gap_s: float = 1.0  # poses further apart are not interpolated between
 
     def __post_init__(self) -> None:
-        _check_positive(self, "credit", "live_unanswered", "send_timeout_s", "poses", "max_gap_s")
+        _check_positive(self, "credit", "live_unanswered", "send_timeout_s", "unread_s")
+        _check_positive(self, "poses", "max_gap_s")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ WIDTH, HEIGHT = 64, 48
 
 @pytest.fixture(scope="session")
 def gateway():
-    with local_gateway(2, "stream.send_timeout_s=1.0", "dispatch.live_timeout_s=1.0") as running:
+    settings = ("stream.send_timeout_s=1.0", "stream.unread_s=5.0", "dispatch.live_timeout_s=1.0")
+    with local_gateway(2, *settings) as running:
         with Client(running.url) as client:
             while not client.ready():
                 pass

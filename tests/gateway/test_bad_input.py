@@ -6,7 +6,6 @@ import socket
 import struct
 import time
 import zlib
-from contextlib import suppress
 from urllib.parse import urlsplit
 
 import httpx
@@ -323,15 +322,6 @@ def test_a_client_that_disconnects_in_the_middle_of_a_stream_hurts_nobody(
     assert codec.unpack(FrameReply, response.content).status is TrackingStatus.TRACKED
 
 
-def _read_to_the_end(connection):
-    """What comes until the other side closes; a time-out is an error."""
-    received = b""
-    with suppress(ConnectionResetError):
-        while piece := connection.recv(1 << 20):
-            received += piece
-    return received
-
-
 def test_a_client_that_never_reads_is_cut_off_and_the_session_goes_on(gateway, offline, good):
     url = f"{gateway.url.replace('http', 'ws')}/v1/sessions/{offline.name}/stream"
     request = (
@@ -343,13 +333,11 @@ def test_a_client_that_never_reads_is_cut_off_and_the_session_goes_on(gateway, o
     with raw_connection(gateway) as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
         connection.sendall(request.encode())
-        connection.settimeout(2.0)  # of a send: the gateway has stopped to read
-        with suppress(OSError):
+        connection.settimeout(60.0)  # of a send; then the gateway has not cut us off
+        with pytest.raises(ConnectionError):
             while True:
                 connection.sendall(nonsense * 1000)
-        connection.settimeout(10.0)
 
-        _read_to_the_end(connection)
     assert post(gateway, offline, codec.pack(good)).status_code == 200
 
 
