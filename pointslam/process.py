@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -13,9 +12,7 @@ from pathlib import Path
 
 from shared.errors import UnavailableError
 
-_PR_SET_PDEATHSIG = 1
 _TAIL_LINES = 15
-_LIBC = ctypes.CDLL(None, use_errno=True)
 _DEFAULTS = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -45,15 +42,15 @@ class ServiceProcess:
         self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
+        tied = ("-m", "pointslam.child", str(os.getpid()))  # not even kill -9 of ours leaves it
         with self.log.open("wb") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", self.command.module, *self.command.arguments],
+                [sys.executable, *tied, self.command.module, *self.command.arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=_DEFAULTS | os.environ | {"PYTHONUNBUFFERED": "1"},
                 process_group=0,  # Ctrl-C is ours to handle, in order; priorities hold in a session
-                preexec_fn=_die_with_parent,
             )
 
     @property
@@ -119,8 +116,3 @@ class ServiceProcess:
 
     def _lines(self) -> list[str]:
         return self.log.read_text(errors="replace").splitlines()
-
-
-def _die_with_parent() -> None:
-    # The kernel's own watch, so that not even kill -9 of the launcher leaves services behind.
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
