@@ -24,8 +24,8 @@ FLAGS = (
     "--use-fake-device-for-media-stream --use-fake-ui-for-media-stream "
     "--remote-debugging-port=0 about:blank"
 )
-_START_S = 30.0
-_ANSWER_S = 30.0
+_START_S = 120.0
+_ANSWER_S = 120.0
 _STEPS = 8  # of a drag
 
 
@@ -77,7 +77,7 @@ class Page:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def wait_for(self, script: str, timeout_s: float = 20.0) -> Any:
+    def wait_for(self, script: str, timeout_s: float = 120.0) -> Any:
         """Wait until an expression is true; its value."""
         deadline = time.monotonic() + timeout_s
         while not (value := self.run(script)):
@@ -169,7 +169,7 @@ def open_page(path: str) -> Iterator[Page]:
                 yield Page(connection)
         finally:
             process.terminate()
-            process.wait(20.0)
+            process.wait(60.0)
 
 
 def _port(file: Path, process: subprocess.Popen[bytes]) -> int:

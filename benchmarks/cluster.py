@@ -36,12 +36,12 @@ class Cluster:
         """End a process as the kernel would when memory is short."""
         victim = self._processes[name]
         os.kill(victim.pid, signal.SIGKILL)
-        victim.wait(10.0)
+        victim.wait(60.0)
 
     def end(self, name: str) -> int:
         """Ask a process to end, as a deploy does; its exit code."""
         self._processes[name].terminate()
-        return self._processes[name].wait(30.0)
+        return self._processes[name].wait(60.0)
 
     def freeze(self, name: str) -> None:
         """Let a process live and do nothing."""

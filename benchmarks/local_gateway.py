@@ -4,7 +4,6 @@ benchmark run against."""
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,7 +11,23 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 from benchmarks.stand_ins import StandInMapper, StandInTracker
+from pointslam.launcher import free_ports
 from shared.bus import Bus, open_bus, open_router
+from shared.fabric import BusConfig, RouterConfig
+
+# A machine that stands still for seconds is no reason to take a process for dead.
+PATIENT_BUS = BusConfig(lease_s=60.0)
+PATIENT_ROUTER = RouterConfig(bus=PATIENT_BUS)
+PATIENCE = (
+    "bus.lease_s=60.0",
+    "dispatch.patience_s=60.0",
+    "dispatch.live_timeout_s=60.0",
+    "dispatch.live_wait_s=60.0",
+    "dispatch.first_frame_timeout_s=60.0",
+    "mapping.claim_wait_s=60.0",
+    "mapping.probe_timeout_s=60.0",
+    "stream.send_timeout_s=60.0",
+)
 
 
 @dataclass(frozen=True)
@@ -29,9 +44,8 @@ class LocalGateway:
 
 
 def free_port() -> int:
-    """A port of this host that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]
+    """A port of this host for a process that is about to start; see `free_ports`."""
+    return free_ports(1)[0]
 
 
 @contextmanager
@@ -39,14 +53,14 @@ def local_gateway(num_trackers: int = 1, *settings: str) -> Iterator[LocalGatewa
     """Start everything; `settings` are key=value words of the gateway."""
     with ExitStack() as stack:
         router = f"tcp/127.0.0.1:{free_port()}"
-        stack.callback(open_router(router).close)
-        bus = stack.enter_context(open_bus([router]))
+        stack.callback(open_router(router, PATIENT_ROUTER).close)
+        bus = stack.enter_context(open_bus([router], PATIENT_BUS))
         # Each on a connection of its own, as separate services are.
         trackers = tuple(
-            StandInTracker(stack.enter_context(open_bus([router])), f"tracker-{i}")
+            StandInTracker(stack.enter_context(open_bus([router], PATIENT_BUS)), f"tracker-{i}")
             for i in range(num_trackers)
         )
-        mapper = StandInMapper(stack.enter_context(open_bus([router])), "mapper-0")
+        mapper = StandInMapper(stack.enter_context(open_bus([router], PATIENT_BUS)), "mapper-0")
         ports = (free_port(), free_port())
         process = stack.enter_context(gateway_process(router, ports, *settings))
         yield LocalGateway(
@@ -70,7 +84,7 @@ def gateway_process(
     """A gateway process, from when it is ready until it has ended."""
     command = [sys.executable, "-m", "services.gateway", "--connect", router, *access]
     command += ["--http-port", str(ports[0]), "--grpc-port", str(ports[1])]
-    command += [word for setting in settings for word in ("--set", setting)]
+    command += [word for setting in (*PATIENCE[:1], *settings) for word in ("--set", setting)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
     assert process.stdout is not None

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.empty_keyframe import empty_keyframe
-from benchmarks.stand_in_answers import Place, export_piece, serve_pins
+from benchmarks.stand_in_answers import Place, export_piece, located, serve_pins
 from shared import se3
 from shared.bus import Bus, Keys
 from shared.errors import ClaimLostError, ConflictError, NotFoundError
 from shared.frames import HAS_POSE, TrackingStatus, TrackRequest
 from shared.georeference import GeoreferenceRequest
 from shared.images import decode_colour, decode_depth
-from shared.localization import LocalizationStatus, LocalizeRequest, LocalizeResult
+from shared.localization import LocalizeRequest, LocalizeResult
 from shared.maps import (
     DeleteRequest,
     Empty,
@@ -57,11 +57,13 @@ _CONCURRENT_FRAMES = 2  # of one tracker, as of a real one
 
 
 class StandInTracker:
-    """Answers each frame with a pose that its number tells, after `delay_s`."""
+    """Answers each frame with a pose that its number tells: after `delay_s`, if it `may_answer`."""
 
     def __init__(self, bus: Bus, name: str) -> None:
         self.name = name
         self.delay_s = 0.0
+        self.may_answer = threading.Event()
+        self.may_answer.set()
         self.status = TrackingStatus.TRACKED
         self.decodes = False
         self.requests: list[TrackRequest] = []
@@ -80,6 +82,7 @@ class StandInTracker:
             decode_colour(request.frame.rgb, request.calibration.colour.intrinsics)
             decode_depth(request.frame.depth, request.calibration)
         time.sleep(self.delay_s)
+        self.may_answer.wait()
         frame, prior = request.frame, request.prior
         reference = prior.newest_keyframe_seq if prior else frame.seq
         is_due = prior is None or frame.seq - reference >= KEYFRAME_EVERY
@@ -106,21 +109,7 @@ class StandInTracker:
         self.images.append(request)
         del self.images[:-100]
         time.sleep(self.delay_s)
-        prior = request.T_world_prior
-        status = LocalizationStatus.COLOUR_ONLY
-        if request.depth is not None:
-            status = LocalizationStatus.LOCALISED
-        return LocalizeResult(
-            status=status if prior is not None else LocalizationStatus.NOT_LOCALISED,
-            reason="" if prior is not None else "no keyframe looks like this",
-            T_world_camera=prior if prior is not None else np.eye(4),
-            covariance=1e-6 * np.eye(6),
-            inliers=100,
-            inlier_share=0.5,
-            reference_seq=0,
-            map_revision=request.map_revision,
-            timings_ms={"decode": 1.0},
-        )
+        return located(request)
 
 
 @dataclass

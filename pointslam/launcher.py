@@ -186,11 +186,20 @@ def _ports(first: int, free: list[int]) -> list[int]:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that nobody listens on now."""
-    sockets = [socket.socket() for _ in range(count)]
-    for opened in sockets:
-        opened.bind((_HOST, 0))
-    ports = [opened.getsockname()[1] for opened in sockets]
-    for opened in sockets:
-        opened.close()
-    return ports
+    """Ports that nobody listens on, and that nobody else is given in the next minute."""
+    return [_reserved_port() for _ in range(count)]
+
+
+def _reserved_port() -> int:
+    """A port with a connection that has just ended here.
+
+    While that is remembered (TIME_WAIT), the kernel gives the port to nobody by itself, but to a
+    service that asks for it by number: no other process that starts meanwhile can get it.
+    """
+    with socket.create_server((_HOST, 0)) as listener:
+        port: int = listener.getsockname()[1]
+        with socket.create_connection((_HOST, port)) as client:
+            ended, _ = listener.accept()
+            ended.close()  # first, so that it is this end that remembers
+            client.recv(1)
+    return port

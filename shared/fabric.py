@@ -21,7 +21,6 @@ from shared.errors import ConfigError
 
 MAX_MESSAGE_BYTES = 256 << 20
 PASSWORD_VARIABLE = "POINTSLAM_BUS_PASSWORD"
-_LEASE_MS = 2000
 _LINK_PROBE_S = 1.0
 _AUTH, _TLS = "transport/auth/usrpwd", "transport/link/tls"
 
@@ -35,10 +34,13 @@ class BusConfig:
     root_certificate: str = ""  # who signs the others' certificates; for endpoints tls/host:port
     certificate: str = ""  # our own, with its key, for routers that ask for one
     private_key: str = ""
+    lease_s: float = 2.0  # the others take a connection of ours that is silent for so long for dead
 
     def __post_init__(self) -> None:
         if bool(self.certificate) != bool(self.private_key):
             raise ConfigError("bus.certificate and bus.private_key belong together: one is missing")
+        if self.lease_s <= 0.0:
+            raise ConfigError(f"bus.lease_s must be positive, got {self.lease_s}")
 
     @property
     def is_named(self) -> bool:
@@ -80,7 +82,7 @@ def client_config(endpoints: list[str], bus: BusConfig) -> zenoh.Config:
     Raises:
         ConfigError: a file cannot be read, or zenoh does not take a value.
     """
-    return _config(_common("client", endpoints, []) | _credentials(bus))
+    return _config(_common("client", endpoints, [], bus) | _credentials(bus))
 
 
 def router_config(config: RouterConfig) -> zenoh.Config:
@@ -90,7 +92,8 @@ def router_config(config: RouterConfig) -> zenoh.Config:
         ConfigError: as `client_config`.
     """
     bus = config.bus
-    settings = _common("router", list(config.routers), list(config.listen)) | _credentials(bus)
+    settings = _common("router", list(config.routers), list(config.listen), bus)
+    settings |= _credentials(bus)
     if config.users_file:
         settings[f"{_AUTH}/dictionary_file"] = _file(config.users_file, "users_file")
     if bus.certificate:
@@ -109,7 +112,7 @@ def answers(endpoints: list[str]) -> list[str]:
     return [endpoint for endpoint in endpoints if _is_listening(endpoint)]
 
 
-def _common(mode: str, connect: list[str], listen: list[str]) -> dict[str, Any]:
+def _common(mode: str, connect: list[str], listen: list[str], bus: BusConfig) -> dict[str, Any]:
     """No scouting, no shared memory, short leases, bounded messages."""
     return {
         "mode": mode,
@@ -122,7 +125,7 @@ def _common(mode: str, connect: list[str], listen: list[str]) -> dict[str, Any]:
         "connect/retry": {"period_max_ms": 1000},
         "listen/endpoints": listen,
         "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS,
+        "transport/link/tx/lease": round(1e3 * bus.lease_s),
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     }
 

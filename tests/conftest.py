@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
+from httpx._config import DEFAULT_TIMEOUT_CONFIG
 
 from pointslam.synth import lit_room
 from pointslam.synth.scene import Scene
+
+
+@pytest.fixture(scope="session", autouse=True)
+def patient_http() -> Iterator[None]:
+    """A bare httpx call gives up after 5 s: a busy machine may stand still for as long."""
+    with pytest.MonkeyPatch.context() as patch:
+        for wait in ("connect", "read", "write", "pool"):
+            patch.setattr(DEFAULT_TIMEOUT_CONFIG, wait, 60.0)
+        yield
 
 
 @pytest.fixture(scope="session")

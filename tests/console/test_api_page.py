@@ -5,14 +5,14 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from benchmarks.local_gateway import local_gateway
+from benchmarks.local_gateway import PATIENCE, local_gateway
 
 pytestmark = pytest.mark.system
 
 
 @pytest.fixture(scope="module")
 def page(browser, pictures):
-    with local_gateway(1) as gateway:
+    with local_gateway(1, *PATIENCE) as gateway:
         browser.resize(1280, 900)
         browser.forget()
         browser.open(f"{gateway.url}/docs")

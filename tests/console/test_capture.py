@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.local_gateway import local_gateway
+from benchmarks.local_gateway import PATIENCE, local_gateway
 from pointslam.client import Client
 from shared import images
 from shared.camera import Calibration, Camera, Intrinsics
@@ -20,7 +20,7 @@ RGB, DEPTH = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 1500, np.uint16)
 
 @pytest.fixture(scope="module")
 def gateway(browser):
-    with local_gateway(1) as running, Client(running.url) as client:
+    with local_gateway(1, *PATIENCE) as running, Client(running.url) as client:
         while not client.ready():
             pass
         browser.forget()

@@ -34,7 +34,7 @@ def test_the_list_shows_the_session_and_how_it_goes(page):
 
 
 def test_the_exact_view_and_the_splats_are_shown_with_the_path_over_them(console, page):
-    page.wait_for(f"{STAGE}.exact && {STAGE}.splats", timeout_s=40.0)
+    page.wait_for(f"{STAGE}.exact && {STAGE}.splats")
     page.wait_for("document.getElementById('exact').naturalWidth > 300")
 
     drawn = page.run(
@@ -88,7 +88,7 @@ def test_a_layer_is_shown_with_its_legend(console, page, layer):
 
 
 def test_splats_are_drawn_by_the_browser_too(console, page):
-    page.wait_for(f"{STAGE}.splats", timeout_s=40.0)
+    page.wait_for(f"{STAGE}.splats")
     page.click("#mode [data-value=splats]")
     page.click("#points")
 
@@ -123,7 +123,7 @@ def test_a_refinement_shows_how_far_it_is_and_ends(page):
     page.run("document.getElementById('refine-iterations').value = 20")
     page.click("#refine")
 
-    page.wait_for("document.getElementById('job').dataset.state === 'done'", timeout_s=30.0)
+    page.wait_for("document.getElementById('job').dataset.state === 'done'")
     assert page.text("#job-text").startswith("Refined: 20 of 20")
 
 
@@ -132,7 +132,7 @@ def test_a_file_is_downloaded(page, what):
     page.run(f"document.querySelector('[data-download=\"{what}\"]').click()")
 
     note = "document.getElementById('action-note').textContent"
-    page.wait_for(f"/: [0-9.]+ [kM]?B\\.$/.test({note})", timeout_s=30.0)
+    page.wait_for(f"/: [0-9.]+ [kM]?B\\.$/.test({note})")
 
 
 @pytest.mark.parametrize("format", ["webm", "mp4"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.local_gateway import local_gateway
+from benchmarks.local_gateway import PATIENCE, local_gateway
 from pointslam.client import Client
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import TrackingStatus
@@ -13,8 +13,7 @@ WIDTH, HEIGHT = 64, 48
 
 @pytest.fixture(scope="session")
 def gateway():
-    settings = ("stream.send_timeout_s=1.0", "stream.unread_s=5.0", "dispatch.live_timeout_s=1.0")
-    with local_gateway(2, *settings) as running:
+    with local_gateway(2, *PATIENCE) as running:
         with Client(running.url) as client:
             while not client.ready():
                 pass

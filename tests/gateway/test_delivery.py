@@ -39,7 +39,7 @@ async def delivered(refusals):
     delivery = to_owner(advance)
     for seq in range(3):
         await delivery.put(entry(seq))
-    assert await delivery.flush(5.0)
+    assert await delivery.flush(60.0)
     return taken
 
 
@@ -67,7 +67,7 @@ def test_a_full_disk_is_told_until_there_is_room_and_nothing_is_lost():
         await delivery.settle()
         problem = delivery.problem
         is_full.clear()
-        await delivery.flush(10.0)
+        await delivery.flush(60.0)
         return str(problem), delivery.problem, taken
 
     assert asyncio.run(run()) == ("no space left", None, [0])
@@ -83,7 +83,7 @@ def test_nobody_waits_for_an_owner_that_is_lost():
 
         delivery = to_owner(advance, lost)
         await delivery.put(entry(0))
-        await asyncio.wait_for(delivery.settle(), 10.0)
+        await asyncio.wait_for(delivery.settle(), 60.0)
         problem = delivery.problem
         delivery.give_up()
         return str(problem)
@@ -101,10 +101,10 @@ def test_an_owner_that_keeps_silent_holds_no_pose_up_and_gets_its_entry_later():
 
         delivery = to_owner(advance, wait_s=0.01)
         await delivery.put(entry(0))
-        await asyncio.wait_for(delivery.settle(), 30.0)
+        await asyncio.wait_for(delivery.settle(), 60.0)
         before = list(taken)
         wakes.set()
-        await delivery.flush(30.0)
+        await delivery.flush(60.0)
         return before, taken
 
     assert asyncio.run(run()) == ([], [0])

@@ -41,7 +41,7 @@ def events_of(gateway, session, count, headers=None):
     """The first `count` server-sent events, as (kind, what)."""
     found = []
     url = url_of(gateway, session, "events")
-    with httpx.stream("GET", url, headers=headers, timeout=5.0) as response:
+    with httpx.stream("GET", url, headers=headers, timeout=60.0) as response:
         kind = ""
         for line in response.iter_lines():
             if line.startswith("event: "):
@@ -178,7 +178,7 @@ def view(gateway, offline, rgb, depth):
 def test_a_camera_is_answered_with_its_layer_as_a_jpeg(view, layer):
     view.send(camera(id=7, layer=layer))
 
-    about, jpeg = json.loads(view.recv(5)), view.recv(5)
+    about, jpeg = json.loads(view.recv(60)), view.recv(60)
 
     assert about["id"] == 7
     assert about["range_m"] == ([1.5, 1.5] if layer == "depth" else None)
@@ -191,8 +191,8 @@ def test_of_many_cameras_the_last_one_is_answered(view):
 
     ids = []
     while not ids or ids[-1] < 199:
-        ids.append(json.loads(view.recv(5))["id"])
-        view.recv(5)
+        ids.append(json.loads(view.recv(60))["id"])
+        view.recv(60)
 
     assert len(ids) < 200
     assert ids == sorted(ids)
@@ -200,12 +200,12 @@ def test_of_many_cameras_the_last_one_is_answered(view):
 
 def test_a_view_comes_again_when_the_map_has_changed(gateway, offline, view, rgb, depth):
     view.send(camera())
-    before = json.loads(view.recv(5))
-    view.recv(5)
+    before = json.loads(view.recv(60))
+    view.recv(60)
     for i in range(1, 12):
         offline.track(rgb, depth, (i + 1) * SECOND)
 
-    after = json.loads(view.recv(5))
+    after = json.loads(view.recv(60))
 
     assert after["map_revision"] > before["map_revision"]
 
@@ -223,11 +223,11 @@ def test_a_view_comes_again_when_the_map_has_changed(gateway, offline, view, rgb
 )
 def test_a_camera_that_makes_no_sense_is_refused_and_the_next_is_drawn(view, message, field):
     view.send(message)
-    refusal = json.loads(view.recv(5))
+    refusal = json.loads(view.recv(60))
     view.send(camera(id=2))
 
     assert refusal["error"]["field"].startswith(field)
-    assert json.loads(view.recv(5))["id"] == 2
+    assert json.loads(view.recv(60))["id"] == 2
 
 
 def test_views_of_no_session_are_refused_with_a_problem(gateway):
@@ -245,7 +245,7 @@ def test_a_live_session_is_saved_while_frames_keep_coming(gateway, live, tracker
     def paced():
         for i, frame in enumerate(queue):
             if i == 20:
-                saved.append(httpx.post(url_of(gateway, live, "save"), timeout=10.0).status_code)
+                saved.append(httpx.post(url_of(gateway, live, "save"), timeout=60.0).status_code)
             yield dataclasses.replace(frame)
 
     saved: list[int] = []

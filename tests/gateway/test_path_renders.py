@@ -208,7 +208,7 @@ def test_events_tell_how_far_it_is_and_the_file_may_be_fetched_twice(gateway, tr
     started = httpx.post(renders_url(gateway, tracked), json={"frames": 3})
     location = f"{gateway.url}{started.headers['location']}"
 
-    with httpx.stream("GET", f"{location}/events", timeout=20.0) as response:
+    with httpx.stream("GET", f"{location}/events", timeout=60.0) as response:
         lines = list(response.iter_lines())
     files = [httpx.get(f"{location}/file") for _ in range(2)]
 

@@ -17,7 +17,7 @@ def test_the_first_to_answer_ends_it_and_the_silent_one_is_named():
         assert await race.ended(0.01) == []
         race.enter("quick", answer(now, "b"))
         now.set()
-        ((worker, task),) = await race.ended(10.0)
+        ((worker, task),) = await race.ended(60.0)
         silent = race.silent(0.0)
         race.close()
         return worker, task.result(), silent
@@ -32,7 +32,7 @@ def test_a_worker_that_failed_is_under_way_no_more():
     async def run():
         race = Race[str]()
         race.enter("broken", fail())
-        ((worker, task),) = await race.ended(10.0)
+        ((worker, task),) = await race.ended(60.0)
         return worker, str(task.exception()), race.workers
 
     assert asyncio.run(run()) == ("broken", "broken", set())

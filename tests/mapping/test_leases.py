@@ -65,68 +65,68 @@ def store(url, tmp_path) -> Iterator[LeaseStore]:
 
 
 def test_a_free_session_is_claimed_above_the_epoch_that_its_folder_knows(store):
-    assert store.claim("room", "a", above=4, ttl_s=10.0) == 5
+    assert store.claim("room", "a", above=4, ttl_s=600.0) == 5
 
 
 def test_a_running_lease_keeps_others_out(store):
-    store.claim("room", "a", above=0, ttl_s=10.0)
+    store.claim("room", "a", above=0, ttl_s=600.0)
 
     with pytest.raises(ConflictError, match=r"owned by a for \d"):
-        store.claim("room", "b", above=0, ttl_s=10.0)
+        store.claim("room", "b", above=0, ttl_s=600.0)
 
 
 def test_an_owner_may_claim_again_in_a_new_epoch(store):
-    first = store.claim("room", "a", above=0, ttl_s=10.0)
+    first = store.claim("room", "a", above=0, ttl_s=600.0)
 
-    assert store.claim("room", "a", above=0, ttl_s=10.0) == first + 1
+    assert store.claim("room", "a", above=0, ttl_s=600.0) == first + 1
 
 
 def test_a_dead_owner_is_succeeded_at_once(store):
-    store.claim("room", "a", above=0, ttl_s=10.0)
+    store.claim("room", "a", above=0, ttl_s=600.0)
 
-    assert store.claim("room", "b", above=0, ttl_s=10.0, departed="a") == 2
+    assert store.claim("room", "b", above=0, ttl_s=600.0, departed="a") == 2
 
 
 def test_a_lease_that_ended_is_taken_and_cannot_be_renewed(store):
     store.claim("room", "a", above=0, ttl_s=0.05)
     time.sleep(0.1)
 
-    epoch = store.claim("room", "b", above=0, ttl_s=10.0)
+    epoch = store.claim("room", "b", above=0, ttl_s=600.0)
 
     assert epoch == 2
-    assert not store.renew("room", "a", 1, 10.0)
-    assert store.renew("room", "b", epoch, 10.0)
+    assert not store.renew("room", "a", 1, 600.0)
+    assert store.renew("room", "b", epoch, 600.0)
 
 
 def test_a_lease_that_ended_and_that_nobody_took_is_renewed(store):
     epoch = store.claim("room", "a", above=0, ttl_s=0.05)
     time.sleep(0.1)
 
-    assert store.renew("room", "a", epoch, 10.0)
+    assert store.renew("room", "a", epoch, 600.0)
 
 
 def test_a_released_session_is_free_at_once(store):
-    store.release("room", "a", store.claim("room", "a", above=0, ttl_s=10.0))
+    store.release("room", "a", store.claim("room", "a", above=0, ttl_s=600.0))
 
-    assert store.claim("room", "b", above=0, ttl_s=10.0) == 2
+    assert store.claim("room", "b", above=0, ttl_s=600.0) == 2
 
 
 def test_a_former_owner_cannot_release_the_next_ones_lease(store):
-    old = store.claim("room", "a", above=0, ttl_s=10.0)
-    store.claim("room", "b", above=0, ttl_s=10.0, departed="a")
+    old = store.claim("room", "a", above=0, ttl_s=600.0)
+    store.claim("room", "b", above=0, ttl_s=600.0, departed="a")
 
     store.release("room", "a", old)
 
     with pytest.raises(ConflictError):
-        store.claim("room", "c", above=0, ttl_s=10.0)
+        store.claim("room", "c", above=0, ttl_s=600.0)
 
 
 def test_two_stores_see_one_table(store, url, tmp_path):
     other = open_lease_store(url, tmp_path)
-    store.claim("room", "a", above=0, ttl_s=10.0)
+    store.claim("room", "a", above=0, ttl_s=600.0)
 
     with pytest.raises(ConflictError):
-        other.claim("room", "b", above=0, ttl_s=10.0)
+        other.claim("room", "b", above=0, ttl_s=600.0)
     other.close()
 
 

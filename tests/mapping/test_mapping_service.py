@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.local_gateway import PATIENT_BUS, PATIENT_ROUTER, free_port
 from shared.bus import Bus, GoneError, Keys, open_bus, open_router
 from shared.errors import ConflictError, InputError, NotFoundError
 from shared.maps import (
@@ -43,11 +43,9 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    router = open_router(f"tcp/127.0.0.1:{port}")
-    yield f"tcp/127.0.0.1:{port}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_router(endpoint, PATIENT_ROUTER)
+    yield endpoint
     router.close()
 
 
@@ -59,7 +57,9 @@ def start_at(endpoint) -> Iterator[Callable[..., subprocess.Popen]]:
     def run(name: str, data: Path, *settings: str) -> subprocess.Popen:
         command = [sys.executable, "-m", "services.mapping", "--connect", endpoint]
         command += ["--id", name, "--data", str(data), "--device", "cpu"]
-        command += [word for setting in settings for word in ("--set", setting)]
+        command += [
+            word for setting in ("bus.lease_s=60.0", *settings) for word in ("--set", setting)
+        ]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None
@@ -81,7 +81,7 @@ def shared_mapper(start_at, tmp_path_factory) -> str:
 
 @pytest.fixture
 def bus(endpoint) -> Iterator[Bus]:
-    with open_bus([endpoint]) as bus:
+    with open_bus([endpoint], PATIENT_BUS) as bus:
         yield bus
 
 
@@ -109,23 +109,23 @@ def wait_for_mapper(bus: Bus, mapper: str) -> None:
             is_seen.set()
 
     bus.watch_alive("mapping", changed)
-    assert is_seen.wait(10.0)
+    assert is_seen.wait(60.0)
 
 
 def opened(bus: Bus, calibration=None, session="room", mapper="m0") -> OpenReply:
     wait_for_mapper(bus, mapper)
     request = OpenRequest(session, "offline", 0, calibration)
-    return bus.query(Keys.mapper(mapper, "open"), request, OpenReply, 30.0)
+    return bus.query(Keys.mapper(mapper, "open"), request, OpenReply, 60.0)
 
 
 def advance(bus: Bus, opening: OpenReply, entry) -> AdvanceReply:
     key = Keys.session(opening.session, opening.epoch, "advance")
-    return bus.query(key, entry, AdvanceReply, 30.0)
+    return bus.query(key, entry, AdvanceReply, 60.0)
 
 
 def ask(bus: Bus, opening: OpenReply, question: str, message, kind):
     key = Keys.session(opening.session, opening.epoch, question)
-    return bus.query(key, message, kind, 30.0)
+    return bus.query(key, message, kind, 60.0)
 
 
 def count_in(ply: bytes) -> int:
@@ -157,7 +157,7 @@ def test_sigterm_ends_the_process_cleanly_with_a_snapshot(start, bus, calibratio
 
     process.send_signal(signal.SIGTERM)
 
-    assert process.wait(timeout=20) == 0
+    assert process.wait(timeout=60) == 0
     assert (tmp_path / "data" / "room" / "snapshot-000001" / "manifest.json").exists()
 
 
@@ -202,9 +202,9 @@ def test_a_deleted_session_is_gone(shared_mapper, bus, calibration, entry):
     opening = opened(bus, calibration, "gone", shared_mapper)
     advance(bus, opening, entry(0))
 
-    bus.query(Keys.mapper(shared_mapper, "delete"), DeleteRequest("gone"), Empty, 30.0)
+    bus.query(Keys.mapper(shared_mapper, "delete"), DeleteRequest("gone"), Empty, 60.0)
 
-    listed = bus.query(Keys.mapper(shared_mapper, "list"), Empty(), SessionList, 30.0)
+    listed = bus.query(Keys.mapper(shared_mapper, "list"), Empty(), SessionList, 60.0)
     assert "gone" not in [summary.session for summary in listed.sessions]
     with pytest.raises(GoneError):
         ask(bus, opening, "info", Empty(), MapInfo)
@@ -218,7 +218,7 @@ def test_the_list_names_open_and_closed_sessions(start, bus, calibration, entry)
     start()
     opened(bus, calibration, "new")
 
-    sessions = bus.query(Keys.mapper("m0", "list"), Empty(), SessionList, 30.0).sessions
+    sessions = bus.query(Keys.mapper("m0", "list"), Empty(), SessionList, 60.0).sessions
 
     found = [(s.session, s.keyframes, s.is_open) for s in sessions]
     assert found == [("new", 0, True), ("old", 1, False)]
@@ -231,7 +231,7 @@ def test_a_damaged_session_does_not_hide_the_others(start, bus, calibration, tmp
     start()
     opened(bus, calibration, "good")
 
-    sessions = bus.query(Keys.mapper("m0", "list"), Empty(), SessionList, 30.0).sessions
+    sessions = bus.query(Keys.mapper("m0", "list"), Empty(), SessionList, 60.0).sessions
 
     assert [s.session for s in sessions] == ["good"]
 
@@ -270,7 +270,7 @@ def wait_until_gone(bus: Bus, opening: OpenReply) -> None:
     key = Keys.mapper(opening.mapper, "list")
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
-        (summary,) = bus.query(key, Empty(), SessionList, 30.0).sessions
+        (summary,) = bus.query(key, Empty(), SessionList, 60.0).sessions
         if not summary.is_open:
             return
         time.sleep(0.1)
@@ -281,8 +281,8 @@ def wait_until_gone(bus: Bus, opening: OpenReply) -> None:
 def frozen_and_taken_over(start_at, bus, tmp_path, calibration, entry):
     """A session whose owner was frozen past its lease and succeeded; the owner is awake again."""
     first, second = f"first-{tmp_path.name}", f"second-{tmp_path.name}"
-    frozen = start_at(first, tmp_path, "owner.lease_s=1.0")
-    start_at(second, tmp_path, "owner.lease_s=1.0")
+    frozen = start_at(first, tmp_path, "owner.lease_s=3.0")
+    start_at(second, tmp_path, "owner.lease_s=3.0")
     before = opened(bus, calibration, tmp_path.name, first)
     for seq in range(5):
         advance(bus, before, entry(seq))

@@ -12,7 +12,7 @@ def test_every_thread_runs_the_kernel_with_the_same_counter():
 
     def kernel(name, counter):
         calls.append((name, id(counter)))
-        meeting.wait(timeout=30)
+        meeting.wait(timeout=60)
 
     Workers(3).run(kernel, "piece")
 
@@ -25,11 +25,11 @@ def test_a_caller_works_alone_while_the_helpers_are_busy():
 
     def endless(counter):
         started.set()
-        release.wait(timeout=30)
+        release.wait(timeout=60)
 
     busy = threading.Thread(target=pool.run, args=(endless,))
     busy.start()
-    started.wait(timeout=30)
+    started.wait(timeout=60)
     calls = []
     pool.run(lambda counter: calls.append(counter))
     release.set()
@@ -42,7 +42,7 @@ def test_what_a_helper_raises_reaches_the_caller():
     meeting = threading.Barrier(2)
 
     def kernel(counter):
-        meeting.wait(timeout=30)
+        meeting.wait(timeout=60)
         if threading.current_thread() is not threading.main_thread():
             raise ValueError("broken")
 

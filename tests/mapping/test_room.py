@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.local_gateway import free_port
+from benchmarks.local_gateway import PATIENT_BUS, PATIENT_ROUTER, free_port
 from services.mapping.config import MappingConfig, OwnerConfig
 from services.mapping.sessions.host import MapperHost, MapperSettings
 from shared.bus import open_bus, open_router
@@ -17,8 +17,8 @@ from shared.tracks import OpenRequest
 @pytest.fixture
 def bus():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    router = open_router(endpoint)
-    with open_bus([endpoint]) as bus:
+    router = open_router(endpoint, PATIENT_ROUTER)
+    with open_bus([endpoint], PATIENT_BUS) as bus:
         yield bus
     router.close()
 

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import threading
-import time
 
+from benchmarks.cluster import wait_for
 from services.mapping.turns import Turns
 
 
-def test_a_visitor_waits_for_one_step_at_most():
-    turns, stop, steps = Turns(), threading.Event(), []
+def test_a_visitor_waits_for_the_step_that_is_running_and_no_other():
+    turns, is_running, may_end, stop = Turns(), *(threading.Event() for _ in range(3))
+    steps = []
 
     def work() -> None:
         while not stop.is_set():
             with turns.step():
-                time.sleep(0.01)
                 steps.append(1)
+                is_running.set()
+                may_end.wait(60.0)
 
-    worker = threading.Thread(target=work)
-    worker.start()
-    waits = []
-    for _ in range(20):
-        before = len(steps)
+    def visit() -> None:
         with turns.visit():
-            waits.append(len(steps) - before)
-    stop.set()
-    worker.join()
+            seen.append(len(steps))
+            stop.set()
 
-    assert max(waits) <= 2  # the step that was running, and one that had just begun
+    seen: list[int] = []
+    worker, visitor = threading.Thread(target=work), threading.Thread(target=visit)
+    worker.start()
+    is_running.wait(60.0)
+    visitor.start()
+    wait_for(lambda: turns._visitors == 1)
+    may_end.set()
+    worker.join()
+    visitor.join()
+
+    assert seen == [1]
 
 
 def test_turns_exclude_each_other():

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import threading
-import time
 from dataclasses import replace
 from itertools import islice
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks import gateway as gateway_benchmark
+from benchmarks.cluster import wait_for
 from pointslam.client import Client
 from pointslam.client.messages import frame_message
 from pointslam.datasets import open_sequence
@@ -44,8 +44,7 @@ def room(tmp_path_factory, lit_scene):
 @pytest.fixture
 def client(services):
     with Client(services.url) as client:
-        while not client.ready():
-            time.sleep(0.05)
+        wait_for(client.ready)
         yield client
 
 
@@ -80,15 +79,12 @@ def process(services, name):
 def kill_and_restart(services, name):
     victim = process(services, name)
     os.kill(victim.pid, signal.SIGKILL)
-    victim.wait(10.0)
+    victim.wait(60.0)
     victim.restart()
 
 
-def wait_for_trackers(services, count):
-    deadline = time.monotonic() + 20.0
-    while httpx.get(f"{services.url}/readyz").json().get("trackers") != count:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+def trackers(services):
+    return httpx.get(f"{services.url}/readyz").json().get("trackers")
 
 
 def test_a_sequence_is_tracked_mapped_and_rendered(session, room):
@@ -200,7 +196,7 @@ def test_a_frozen_tracker_is_left_for_another(services, session, room):
             replies += stream(session, room, len(replies), len(replies) + 3)
         finally:
             os.kill(frozen, signal.SIGCONT)
-        wait_for_trackers(services, 2)
+        wait_for(lambda: trackers(services) == 2)
 
     assert [reply.seq for reply in replies] == list(range(8))
     assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
@@ -238,8 +234,7 @@ def test_an_image_is_found_in_a_map_taken_up_from_disk(services, session, room):
 def test_a_gateway_killed_in_the_middle_takes_the_session_up_again(services, client, session, room):
     stream(session, room, 0, 5)
     kill_and_restart(services, "gateway-0")
-    while not client.ready():
-        time.sleep(0.05)
+    wait_for(client.ready)
 
     resumed = client.session(session.name)
     replies = stream(resumed, room, 5, 10)
