@@ -88,8 +88,10 @@ class StoreSource:
         self._fetched: dict[_Key, Future[LocalMap]] = {}
 
     def build_ahead(self, seq: int) -> None:
-        """What the map's owner does as soon as it has a keyframe."""
+        """What the map's owner does as soon as it knows where the next frame starts."""
         self._forget_older()
+        if self._key(seq, False) in self._fetched or self._key(seq, False) in self._built:
+            return
         context = self._store.context(seq)
         self._built[self._key(seq, False)] = codec.pack(context)
         for loop_seq in context.loop_seqs.tolist():
@@ -209,8 +211,9 @@ def track_all(
             result = track(request, source, config, helper)
             if result.keyframe is not None:
                 store.insert(index, result.t_ns, result.T_world_camera, result.keyframe)
-                source.build_ahead(index)
             prior = next_prior(prior, request.frame, result)
+            if prior is not None:
+                source.build_ahead(prior.reference_seq)
             results.append(result)
     return Tracked(results, store)
 

@@ -141,6 +141,15 @@ def _registration(
     )
 
 
+def overlap(
+    source: PointCloud, level: VoxelLevel, T: NDArray[np.float64], config: RegistrationConfig
+) -> float:
+    """Share of the source that has a plane of the level within a voxel's side at a pose."""
+    sample = _every(source, config.sample_steps[0])
+    found, _, _ = correspond((sample.points, sample.normals), _arrays(level), T, _limits(config))
+    return len(found) / max(1, len(sample.points))
+
+
 def optimum(registration: Registration, config: RegistrationConfig) -> NDArray[np.float64]:
     """The pose where a linearised registration has its minimum, T_world_camera."""
     H, share = registration.information, config.min_eigenvalue_share

@@ -3,7 +3,7 @@ import pytest
 
 from services.tracking.config import RegistrationConfig, SurfaceConfig
 from services.tracking.point_cloud import surface_from_depth
-from services.tracking.registration import align, linearise, optimum
+from services.tracking.registration import align, linearise, optimum, overlap
 from services.tracking.voxel_map import build_voxel_map
 from shared.se3 import angle_rad, exp, inverse
 from shared.tracks import PointCloud
@@ -123,6 +123,15 @@ def test_nothing_in_common_gives_no_overlap_and_no_step(room):
 
     assert registration.overlap == 0.0
     np.testing.assert_array_equal(registration.T_world_camera, start)
+
+
+def test_the_coarsest_level_shows_a_place_through_some_drift_and_no_other_place(room):
+    cloud = cloud_of(room, CORNER)
+    coarsest = build_voxel_map(cloud, CONFIG.voxel_sizes_m).levels[0]
+    drifted, behind = exp([0.1, 0.05, -0.08, 0.0, 0.05, 0.0]), exp([0.0, 0.0, 0.0, 0.0, np.pi, 0.0])
+
+    assert overlap(cloud, coarsest, drifted, CONFIG) > 0.8
+    assert overlap(cloud, coarsest, behind, CONFIG) < 0.05
 
 
 def test_the_two_sides_of_a_thin_wall_stay_apart():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from services.mapping.keyframes.store import KeyframeStore
 from shared.tracks import ContextRequest, TrackingContext
 
-_MAX_KEPT = 4  # a frame's own and those of its loop candidates; each is some MB
+_MAX_KEPT = 8  # those of two references and of their loop candidates; each is some MB
 
 
 class Contexts:

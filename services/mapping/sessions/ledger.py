@@ -133,15 +133,21 @@ class Ledger:
         """
         check_entry(entry)
         with self._lock:
-            last, record = self.last, entry.record
+            last, record, reference_seq = self.last, entry.record, self._reference_seq
             if last is not None and record.seq <= last.seq:
                 raise ConflictError(f"frame {record.seq} is not newer than {last.seq}")
             with LOG_SECONDS.time():
                 self._log.append(entry)
             new = self._apply(entry)
-        if new is not None:
-            self._ahead.submit(self._build_ahead, record.seq)
+            next_seq = self._reference_seq
+        if new is not None or next_seq != reference_seq:
+            self._ahead.submit(self._build_ahead, next_seq)
         return new
+
+    @property
+    def _reference_seq(self) -> int:
+        """The keyframe whose neighbourhood the next frame is tracked in; -1: the newest one."""
+        return self.prior.reference_seq if self.prior else -1
 
     def _build_ahead(self, seq: int) -> None:
         """What the next frames ask for is there when they come."""
