@@ -4,7 +4,7 @@
 FROM nvidia/cuda:13.0.1-devel-ubuntu24.04
 
 ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_WAIT_POLICY=passive MALLOC_ARENA_MAX=2 \
-    MALLOC_MMAP_THRESHOLD_=8388608 \
+    MALLOC_MMAP_THRESHOLD_=4194304 \
     PYTHONUNBUFFERED=1
 RUN apt-get update && apt-get install -y --no-install-recommends python3 python3-venv python3-dev \
     && rm -rf /var/lib/apt/lists/* && python3 -m venv /opt/venv

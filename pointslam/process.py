@@ -18,7 +18,7 @@ _DEFAULTS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "2",  # else what each of many threads once needed stays with its own arena
-    "MALLOC_MMAP_THRESHOLD_": "8388608",  # else large arrays that are gone leave holes behind
+    "MALLOC_MMAP_THRESHOLD_": "4194304",  # else large arrays that are gone leave holes behind
 }
 
 

@@ -170,7 +170,7 @@ class ScheduleConfig:
     draws: str = "all"  # keyframes, or the "overlapping" ones, that see what the newest sees
     min_overlap: float = 0.3  # of the newest keyframe's points
     cached_views: int = 2  # with their statistics for SSIM: 19 MB each at 640x480, 3 ms to remake
-    cached_images_mb: int = 96  # decoded images: 2 MB each at 640x480, 5 ms to decode anew
+    cached_images_mb: int = 48  # decoded images: 2 MB each at 640x480, 5 ms to decode anew
     min_shift_m: float = 0.002  # a keyframe corrected by more takes its anchors along
     min_turn_deg: float = 0.05
 

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.rasterizer import room
 from services.mapping.rasterizer import CpuRasterizer, View
 from services.mapping.rasterizer.cpu import Engine
-from services.mapping.rasterizer.scratch import MOST_BYTES, Scratch
+from services.mapping.rasterizer.scratch import MOST_BYTES, MOST_IN_ALL, Scratch
 from services.mapping.rasterizer.threads import workers
 from shared.camera import Intrinsics
 
@@ -72,6 +72,17 @@ def test_what_is_kept_for_the_next_call_is_bounded():
     lent.clear()
 
     assert 0.8 * MOST_BYTES < scratch.num_bytes <= MOST_BYTES
+
+
+def test_nothing_idle_is_kept_beside_as_much_as_all_may_be():
+    scratch = Scratch()
+    small = [scratch.borrow(1 << 20, np.uint8) for _ in range(30)]
+    small.clear()
+
+    large = scratch.borrow(MOST_IN_ALL, np.uint8)
+
+    assert scratch.num_bytes == 0
+    assert large.size == MOST_IN_ALL
 
 
 def test_the_work_grows_no_faster_than_the_scene():

@@ -12,6 +12,7 @@ from services.mapping.export.splat_gltf import write_gltf
 from services.mapping.export.splat_ply import write_ply
 from services.mapping.export.splat_spz import write_spz
 from services.mapping.export.splats import Splats
+from services.mapping.spare_memory import give_back
 from shared.maps import ExportFormat
 
 _SPLATS = {
@@ -35,6 +36,7 @@ def write_map(file: BinaryIO, format: ExportFormat, visit: Visit, config: Export
     Raises:
         UnavailableError: the map is empty and the format cannot say so, or a package is absent.
     """
+    give_back()
     if format in _SURFACES:
         file.write(_SURFACES[format](visit))
         return

@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 CACHE_LINE = 64  # bytes; a record that straddled two would cost two
 MOST_BYTES = 160 << 20  # kept between calls: an iteration has 60 to 140 MB, now and then a view 300
+MOST_IN_ALL = 256 << 20  # lent and kept together: what is lent beyond leaves nothing idle beside it
 _MOST = 96  # arrays kept; two whole iterations of the mapper have fewer
 
 
@@ -29,6 +30,7 @@ class Scratch:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._free: list[NDArray[np.uint8]] = []  # longest ago used first
+        self._num_bytes_lent = 0
         # The last reference may go at any moment, even to the thread that holds the lock.
         self._returned: deque[NDArray[np.uint8]] = deque()
 
@@ -51,6 +53,12 @@ class Scratch:
             self._collect()
             return sum(memory.size for memory in self._free)
 
+    def release(self) -> None:
+        """Keep nothing for the next call: memory is wanted elsewhere."""
+        with self._lock:
+            self._collect()
+            self._let_go(0)
+
     def _take(self, num_bytes: int) -> NDArray[np.uint8]:
         """The least free array that is large enough, but not far too large, or a new one."""
         with self._lock:
@@ -58,16 +66,27 @@ class Scratch:
             sizes = [memory.size for memory in self._free]
             fitting = [s for s in sizes if num_bytes <= s <= 2 * num_bytes + 4096]
             if fitting:
-                return self._free.pop(sizes.index(min(fitting)))
-        memory = np.empty(num_bytes + num_bytes // 4 + CACHE_LINE, np.uint8)
-        return memory[-memory.ctypes.data % CACHE_LINE :]
+                memory = self._free.pop(sizes.index(min(fitting)))
+            else:
+                fresh_bytes = num_bytes + num_bytes // 4 + CACHE_LINE
+                self._let_go(min(MOST_BYTES, MOST_IN_ALL - self._num_bytes_lent - fresh_bytes))
+                fresh = np.empty(fresh_bytes, np.uint8)
+                memory = fresh[-fresh.ctypes.data % CACHE_LINE :]
+            self._num_bytes_lent += memory.size
+            return memory
 
     def _collect(self) -> None:
         """Take up what came back; let go of what is too much."""
         while self._returned:
-            self._free.append(self._returned.popleft())
+            memory = self._returned.popleft()
+            self._num_bytes_lent -= memory.size
+            self._free.append(memory)
+        self._let_go(MOST_BYTES)
+
+    def _let_go(self, most_bytes: int) -> None:
+        """Keep no more than this for the next call, what was used last."""
         total = sum(memory.size for memory in self._free)
-        while total > MOST_BYTES or len(self._free) > _MOST:
+        while self._free and (total > most_bytes or len(self._free) > _MOST):
             total -= self._free.pop(0).size
 
 

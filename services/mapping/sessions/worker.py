@@ -21,6 +21,7 @@ from services.mapping.config import MappingConfig
 from services.mapping.map_state import MapState
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.priority import give_way
+from services.mapping.spare_memory import give_back
 from services.mapping.storage.refinement import Refinement
 from services.mapping.turns import Turns
 from services.mapping.views.training_views import TrainingView
@@ -127,6 +128,7 @@ class MapWorker:
 
     def room(self) -> dict[str, Tensor]:
         """Memory for the state of the anchors as they are about now."""
+        give_back()
         return self._mapper.anchors.rows.room()
 
     def refine(self, iterations: int) -> JobStatus:
