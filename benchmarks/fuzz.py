@@ -30,7 +30,7 @@ from websockets.sync.client import ClientConnection
 
 from benchmarks.fuzz_inputs import spoiled, spoiled_bytes, spoiled_message, strange_word
 from benchmarks.fuzz_openapi import send_cases
-from benchmarks.local_gateway import LocalGateway, local_gateway
+from benchmarks.local_gateway import PATIENCE, LocalGateway, local_gateway
 from pointslam.client import Client, frame_message
 from pointslam.client.frame_stream import open_stream
 from services.gateway.access.routes import GRPC
@@ -68,7 +68,7 @@ class Fuzzer:
     def __init__(self, gateway: LocalGateway, seed: int) -> None:
         self._gateway = gateway
         self._rng = random.Random(seed)
-        self._http = httpx.Client(base_url=gateway.url, timeout=30.0)
+        self._http = httpx.Client(base_url=gateway.url, timeout=60.0)
         self._stack = ExitStack()
         self._socket: ClientConnection | None = None
         self._channel = grpc.insecure_channel(gateway.grpc_address)
@@ -121,7 +121,7 @@ class Fuzzer:
                 url = f"{self._gateway.url.replace('http', 'ws')}/v1/sessions/{_NAME}/stream"
                 self._socket = self._stack.enter_context(open_stream(url))
             self._socket.send(message)
-            answer = self._socket.recv(timeout=30.0)
+            answer = self._socket.recv(timeout=60.0)
         except ConnectionClosed as error:
             self._socket = None
             code = error.rcvd.code if error.rcvd else 1006
@@ -186,14 +186,14 @@ def _call(channel: grpc.Channel, method: str, request: bytes) -> str:
     """The name of the status of a call; streams are followed to their first answer."""
     try:
         if method.endswith(_STREAMED):
-            list(channel.stream_stream(method)(iter([request]), timeout=30))
+            list(channel.stream_stream(method)(iter([request]), timeout=60))
         elif method.endswith(_STREAMING):
             call = channel.unary_stream(method)(request, timeout=0.1)
             for _ in call:
                 call.cancel()
                 return "OK"
         else:
-            channel.unary_unary(method)(request, timeout=30)
+            channel.unary_unary(method)(request, timeout=60)
     except grpc.RpcError as error:
         failed: Any = error
         return failed.code().name
@@ -222,7 +222,7 @@ def fuzz(inputs: int, seed: int) -> dict[str, Outcome]:
         OSError: the gateway has ended.
     """
     outcomes = {}
-    with local_gateway(2) as gateway:
+    with local_gateway(2, *PATIENCE) as gateway:
         fuzzer = Fuzzer(gateway, seed)
         doors: dict[str, Callable[[Outcome], None]] = {
             "http": fuzzer.http,

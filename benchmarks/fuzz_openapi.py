@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from schemathesis.core.result import Ok
 
 _ENDLESS = "/events"  # streams that end with their session
-_WAIT_S = 30.0
+_WAIT_S = 60.0
 _UNHEALTHY = (HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from benchmarks.stand_ins import StandInMapper, StandInTracker
 from pointslam.launcher import free_ports
+from pointslam.settings import ROLES, ServiceSettings
 from shared.bus import Bus, open_bus, open_router
 from shared.fabric import BusConfig, RouterConfig
 
@@ -28,6 +29,7 @@ PATIENCE = (
     "mapping.probe_timeout_s=60.0",
     "stream.send_timeout_s=60.0",
 )
+PATIENT_SERVICES = ServiceSettings({role: {"bus": {"lease_s": 60.0}} for role in ROLES})
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,14 @@ from collections.abc import Iterator
 
 import pytest
 from httpx._config import DEFAULT_TIMEOUT_CONFIG
+from hypothesis import settings
 
 from pointslam.synth import lit_room
 from pointslam.synth.scene import Scene
+
+# The same examples everywhere, and none that fails because the machine stood still for 0.2 s.
+settings.register_profile("pointslam", derandomize=True, deadline=None)
+settings.load_profile("pointslam")
 
 
 @pytest.fixture(scope="session", autouse=True)

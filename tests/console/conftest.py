@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.browser import Page, chromium_path, open_page
+from benchmarks.local_gateway import PATIENT_SERVICES
 from pointslam.client import Client
 from pointslam.datasets import open_sequence
 from pointslam.launcher import LaunchOptions, Services
@@ -58,7 +59,13 @@ def console(browser, pictures, tmp_path_factory, lit_scene) -> Iterator[Console]
     folder = tmp_path_factory.mktemp("console")
     record_scene(folder / "room", lit_scene, ROOM)
     room = open_sequence(folder / "room")
-    options = LaunchOptions(folder / "data", folder / "logs", num_trackers=1, device="cpu")
+    options = LaunchOptions(
+        folder / "data",
+        folder / "logs",
+        num_trackers=1,
+        device="cpu",
+        settings=PATIENT_SERVICES,
+    )
     with Services(options) as services, Client(services.url) as client:
         while not client.ready():
             pass

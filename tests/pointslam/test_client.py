@@ -6,7 +6,7 @@ import httpx
 import numpy as np
 import pytest
 
-from benchmarks.local_gateway import local_gateway
+from benchmarks.local_gateway import PATIENCE, local_gateway
 from pointslam.client import AsyncClient, Client, FrameOptions, calls, frame_message
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.errors import (
@@ -31,7 +31,7 @@ DEPTH = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
 
 @pytest.fixture(scope="module")
 def gateway():
-    with local_gateway() as running, Client(running.url) as client:
+    with local_gateway(1, *PATIENCE) as running, Client(running.url) as client:
         while not client.ready():
             pass
         yield running

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cluster import wait_for
+from benchmarks.local_gateway import PATIENT_SERVICES
 from pointslam.client import Client, FrameOptions
 from pointslam.launcher import LaunchOptions, Services
 from shared.camera import Calibration, Camera, Intrinsics
@@ -44,7 +45,12 @@ def received(tmp_path):
 def url(received, tmp_path):
     traces = f"http://127.0.0.1:{received.read_text().strip()}"
     options = LaunchOptions(
-        tmp_path / "data", tmp_path / "logs", num_trackers=1, device="cpu", traces=traces
+        tmp_path / "data",
+        tmp_path / "logs",
+        num_trackers=1,
+        device="cpu",
+        traces=traces,
+        settings=PATIENT_SERVICES,
     )
     with Services(options) as started:
         yield started.url
