@@ -15,7 +15,7 @@ from services.gateway.prior import next_prior
 from services.mapping.keyframes.store import KeyframeConfig, KeyframeStore
 from services.tracking.config import TrackingConfig
 from services.tracking.executors import NoHelper
-from services.tracking.local_map import LocalMap, derive
+from services.tracking.local_map import LocalMap
 from services.tracking.pipeline import track
 from shared import codec
 from shared.camera import Calibration, Camera, Intrinsics
@@ -123,7 +123,8 @@ class StoreSource:
             _, seq, is_near_only = key
             ask = self._store.loop_context if is_near_only else self._store.context
             built = codec.pack(ask(seq))
-        return derive(codec.unpack(TrackingContext, built), self._config.registration)
+        local = LocalMap(codec.unpack(TrackingContext, built), self._config.registration)
+        return local if key[2] else local.built()
 
     def local_map(self, reference_seq: int) -> LocalMap:
         """The neighbourhood of a keyframe."""

@@ -15,7 +15,7 @@ from typing import Any
 
 from services.tracking import metrics
 from services.tracking.config import TrackingConfig
-from services.tracking.local_map import LocalMap, derive
+from services.tracking.local_map import LocalMap
 from services.tracking.localization import localize
 from services.tracking.pipeline import track
 from shared.bus import Bus, Keys
@@ -174,7 +174,8 @@ class BusSource:
         local = self._cache.get((session, epoch, asked.revision, reference_seq, is_near_only))
         if local is None:
             context: TrackingContext = self._ask("context", asked, TrackingContext)
-            local = derive(context, self._config.registration)
+            local = LocalMap(context, self._config.registration)
+            local = local if is_near_only else local.built()  # few loop candidates are attempted
             # A live map may have moved on: then this is the answer for its revision only.
             key = (session, epoch, context.revision, reference_seq, is_near_only)
             self._cache.put(key, local)

@@ -29,7 +29,7 @@ def loop_seen_from(
     observed = observe(images, session.config, Stopwatch(), NoHelper())
     job = Job(session.request(frame), observed, source, session.config, Stopwatch())
     local = source.local_map(0)
-    named = LocalMap(replace(local.context, loop_seqs=np.array([0])), local.voxels)
+    named = LocalMap(replace(local.context, loop_seqs=np.array([0])), local.config)
     estimate = replace(job.attempt(named, pose), T_world_camera=drift @ pose)
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
     return find_loop(job, estimate, keyframe_observations(9, observed.features, none))

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.tracking_run import Folder
 from services.tracking.config import KeyframeRuleConfig
 from services.tracking.keyframes import Coverage, Sharpness, is_too_blurred, sharpness_of
-from services.tracking.sharpness import edge_blur_px
+from services.tracking.sharpness import edge_blur_px, gradients
 from shared.camera import Intrinsics
 from shared.images import decode_colour
 from shared.rectify import RgbdImage
@@ -54,6 +54,16 @@ def test_the_blur_of_a_motion_is_seen_in_any_direction(length_px, angle_rad):
 @pytest.mark.parametrize(("low", "high"), [(60, 190), (30, 95), (100, 130)])
 def test_sharp_edges_are_about_a_pixel_wide_whatever_the_scene_and_exposure(cell_px, low, high):
     assert 0.5 < edge_blur_px(checks(cell_px, low, high)) < 1.3
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (49, 65), (2, 3)])
+def test_gradients_are_those_of_every_second_pixel_that_opencv_finds(shape):
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+
+    x, y = gradients(image)
+
+    np.testing.assert_array_equal(x, cv2.Sobel(image, cv2.CV_16S, 1, 0)[::2, ::2])
+    np.testing.assert_array_equal(y, cv2.Sobel(image, cv2.CV_16S, 0, 1)[::2, ::2])
 
 
 def test_an_image_without_edges_has_no_blur_to_speak_of():
