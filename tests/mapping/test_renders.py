@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.cluster import wait_for
 from services.mapping.config import DensificationConfig, MappingConfig, RenderConfig
 from services.mapping.pipeline import Mapper, NewKeyframe
 from services.mapping.sessions.renders import Renders
@@ -71,20 +72,25 @@ def test_renders_beside_the_work_are_those_of_the_map_between_its_steps(
         alone, lambda: expected.update({alone.moment: images(alone.render(request_view))})
     )
     busy = Mapper(calibration, CONFIG, 0, torch.device("cpu"))
-    is_done = threading.Event()
+    is_done, seen = threading.Event(), []
 
-    def watch() -> list:
-        seen = []
+    def watch() -> None:
         while not is_done.is_set():
             seen.append(busy.render_at(request_view))
-        return seen
+
+    def until_one_more_is_seen() -> None:
+        before = len(seen)
+        wait_for(lambda: len(seen) > before)
 
     with ThreadPoolExecutor(3) as pool:
         watchers = [pool.submit(watch) for _ in range(3)]
-        work_and_refine(busy, lambda: None)
-        is_done.set()
+        try:
+            work_and_refine(busy, until_one_more_is_seen)
+        finally:
+            is_done.set()
+    for watcher in watchers:
+        watcher.result()
 
-    seen = [pair for watcher in watchers for pair in watcher.result()]
     assert len({moment for moment, _ in seen}) > 5
     wrong = [
         moment
