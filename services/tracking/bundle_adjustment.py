@@ -90,7 +90,8 @@ class _Solver:
         self, problem: BundleProblem, intrinsics: Intrinsics, config: BundleAdjustmentConfig
     ) -> None:
         assert (np.diff(problem.point_index) >= 0).all()
-        self._problem = problem
+        p = self._problem = problem
+        self._seen = (p.camera_index, p.point_index, p.measured, p.sigmas)
         self._huber = config.huber_sigma
         self._camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
         landmarks = np.arange(len(problem.points_world) + 1)
@@ -98,20 +99,10 @@ class _Solver:
         self._free = np.flatnonzero(np.repeat(~problem.is_fixed, 6))
 
     def cost(self, state: _State) -> float:
-        p = self._problem
-        views = inverse(state.T_world_cameras)
-        features = huber_cost(
-            views,
-            state.points_world,
-            p.camera_index,
-            p.point_index,
-            p.measured,
-            p.sigmas,
-            self._camera,
-            self._huber,
-        )
-        steps = self._steps(state)
-        return features + float(np.einsum("ki,kij,kj->", steps, p.pose_information, steps))
+        seen_from = (inverse(state.T_world_cameras), state.points_world)
+        features = huber_cost(seen_from, self._seen, self._camera, self._huber)
+        steps, information = self._steps(state), self._problem.pose_information
+        return features + float(np.einsum("ki,kij,kj->", steps, information, steps))
 
     def _steps(self, state: _State) -> NDArray[np.float64]:
         start = inverse(self._problem.T_world_priors)
@@ -121,16 +112,8 @@ class _Solver:
 
     def linearise(self, state: _State) -> _System:
         p = self._problem
-        Hcc, Hpp, Hcp, bc, bp = linearise(
-            inverse(state.T_world_cameras),
-            state.points_world,
-            p.camera_index,
-            p.point_index,
-            p.measured,
-            p.sigmas,
-            self._camera,
-            self._huber,
-        )
+        seen_from = (inverse(state.T_world_cameras), state.points_world)
+        Hcc, Hpp, Hcp, bc, bp = linearise(seen_from, self._seen, self._camera, self._huber)
         pull = np.einsum("kij,kj->ki", p.pose_information, self._steps(state))
         return _System(Hcc + p.pose_information, Hpp, Hcp, bc + pull, bp)
 
@@ -149,11 +132,7 @@ class _Solver:
     def _step(self, system: _System, state: _State, damping: float) -> _State:
         p = self._problem
         S, b, Hpp_inverse = eliminate_landmarks(
-            system.Hcc,
-            system.Hpp,
-            system.Hcp,
-            system.bc,
-            system.bp,
+            (system.Hcc, system.Hpp, system.Hcp, system.bc, system.bp),
             p.camera_index,
             self._starts,
             damping,

@@ -3,6 +3,9 @@
 K cameras, L landmarks, O observations in ascending order of the landmark. Views are
 T_camera_world [K, 4, 4]; camera is (fx, fy, cx, cy); increments are twists in the camera frame,
 T_world_camera @ exp(twist), so that a point of the camera frame moves by -(rho + phi x y).
+
+A state is (views, points [L, 3]); what was seen is (camera_index [O], point_index [O], measured
+[O, 3], sigmas [O, 2]), as in `BundleProblem`; a system is (Hcc, Hpp, Hcp, bc, bp).
 """
 
 from __future__ import annotations
@@ -23,10 +26,10 @@ def _residuals(view, X, measured, sigmas, camera, y, r):  # noqa: PLR0913 - comp
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def huber_cost(  # noqa: PLR0913 - compiled
-    views, points, camera_index, point_index, measured, sigmas, camera, huber
-):  # pragma: no cover - compiled
+def huber_cost(state, seen, camera, huber):  # pragma: no cover - compiled
     """Sum of the Huber kernel over pixels and depths."""
+    views, points = state
+    camera_index, point_index, measured, sigmas = seen
     y = np.zeros(3)
     r = np.zeros(3)
     cost = 0.0
@@ -40,10 +43,10 @@ def huber_cost(  # noqa: PLR0913 - compiled
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def linearise(  # noqa: C901, PLR0913 - compiled
-    views, points, camera_index, point_index, measured, sigmas, camera, huber
-):  # pragma: no cover - compiled
+def linearise(state, seen, camera, huber):  # noqa: C901  # pragma: no cover - compiled
     """Blocks of the normal equations: Hcc, Hpp, Hcp (one an observation), bc, bp."""
+    views, points = state
+    camera_index, point_index, measured, sigmas = seen
     Hcc = np.zeros((len(views), 6, 6))
     Hpp = np.zeros((len(points), 3, 3))
     Hcp = np.zeros((len(camera_index), 6, 3))
@@ -96,10 +99,11 @@ def linearise(  # noqa: C901, PLR0913 - compiled
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def eliminate_landmarks(  # noqa: C901, PLR0913 - compiled
-    Hcc, Hpp, Hcp, bc, bp, camera_index, starts, damping
+def eliminate_landmarks(  # noqa: C901 - compiled
+    system, camera_index, starts, damping
 ):  # pragma: no cover - compiled
     """Schur complement of the landmarks: the reduced system S, b and the inverses of Hpp."""
+    Hcc, Hpp, Hcp, bc, bp = system
     count = len(Hcc)
     S = np.zeros((6 * count, 6 * count))
     b = bc.copy().reshape(6 * count)

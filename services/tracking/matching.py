@@ -42,17 +42,16 @@ def match_by_projection(
         return _no_matches()
     i = intrinsics
     best, distances = _search(
-        landmarks.positions_world,
-        landmarks.normals_world,
-        words_of(landmarks.descriptors),
-        landmarks.octaves,
-        landmarks.distances_m,
-        inverse(T_world_camera),
-        np.array([i.fx, i.fy, i.cx, i.cy]),
+        (
+            landmarks.positions_world,
+            landmarks.normals_world,
+            words_of(landmarks.descriptors),
+            landmarks.octaves,
+            landmarks.distances_m,
+        ),
+        (features.keypoints_px, features.octaves, words_of(features.descriptors)),
         grid_of(features.keypoints_px, i.width, i.height),
-        features.keypoints_px,
-        features.octaves,
-        words_of(features.descriptors),
+        (inverse(T_world_camera), np.array([i.fx, i.fy, i.cx, i.cy])),
         np.array([config.search_radius_px, config.max_hamming_bits, config.ratio]),
     )
     return _one_to_one(best, distances, len(features.octaves))
@@ -141,27 +140,21 @@ def grid_of(pixels, width, height):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(  # noqa: C901, PLR0913 - compiled
-    positions,
-    normals,
-    words,
-    octaves,
-    distances,
-    T_camera_world,
-    camera,
-    grid,
-    pixels,
-    feature_octaves,
-    feature_words,
-    limits,
-):  # pragma: no cover - compiled
+def _search(landmarks, features, grid, view, limits):  # noqa: C901  # pragma: no cover - compiled
+    """The nearest feature of each landmark [L], -1 where none will do, and its bits.
+
+    Landmarks are (positions, normals, words, octaves, distances), features (pixels, octaves,
+    words), `grid` theirs, `view` (T_camera_world, camera), limits (radius, bits, ratio).
+    """
+    positions, normals, words, octaves, distances = landmarks
+    pixels, feature_octaves, feature_words = features
+    R, camera = view
     starts, order, columns = grid
     rows = (len(starts) - 1) // columns
     count = len(positions)
     best = np.full(count, -1, np.int64)
     bits = np.full(count, 257, np.int64)
     margin = limits[0] * 1.2**4  # the largest radius of a search
-    R = T_camera_world
     for n in range(count):
         X = positions[n]
         x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + R[0, 3]

@@ -77,7 +77,7 @@ def _fit_planes(depth, camera, stride, radius, limits):  # pragma: no cover - co
     normals = np.empty((capacity, 3), np.float32)
     count = 0
     for v in range(stride // 2, height, stride):
-        sums = _row_sums(depth, v, columns, stride, radius // 3, camera, limits)
+        sums = _row_sums(depth, v, (columns, stride, radius // 3), camera, limits)
         for k in range(columns):
             u = stride // 2 + k * stride
             z = depth[v, u]
@@ -95,13 +95,15 @@ def _fit_planes(depth, camera, stride, radius, limits):  # pragma: no cover - co
 
 
 @numba.njit(cache=True, nogil=True)
-def _row_sums(depth, v, columns, stride, step, camera, limits):  # noqa: PLR0913 - compiled
+def _row_sums(depth, v, grid, camera, limits):  # pragma: no cover - compiled
     """Sums of `_SUMS` over the windows of one row of the grid, [9, columns].
 
+    `grid` is the number of columns, the pixels between them and between the readings of a window.
     The loop over the samples is the inner one and has no branch, so that it becomes vectors; each
     sample still adds up its window in the order of `_fit_plane`, to the same bits.
     """
     height, width = depth.shape
+    columns, stride, step = grid
     first = stride // 2
     sums = np.zeros((_SUMS, columns))
     z = depth[v, first::stride].copy()

@@ -168,5 +168,5 @@ def _normal_equations(
         return NormalEquations(np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), 0.0, 1.0)
     scale = residual_scale(residuals)
     width = max(config.kernel_width * scale, config.min_kernel_width)
-    H, signal, b = accumulate(cloud, planes, T, limits, found, width, True)
+    H, signal, b = accumulate(cloud, planes, (T, limits, width), found, True)
     return NormalEquations(H, signal, b, len(residuals) / len(source.points), scale)

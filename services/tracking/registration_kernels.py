@@ -29,7 +29,7 @@ def descend(source, level, T, limits, kernel, stop):  # noqa: PLR0913 - compiled
             break
         width = max(kernel[0] * residual_scale(residuals), kernel[1])
         found = (points, planes, residuals)
-        H, _, b = accumulate(source, level, T, limits, found, width, False)
+        H, _, b = accumulate(source, level, (T, limits, width), found, False)
         twist = _known_step(H, b, stop[2])
         T = T @ exp_twist(twist)
         if np.linalg.norm(twist[:3]) < stop[1] and np.linalg.norm(twist[3:]) < stop[1]:
@@ -62,7 +62,7 @@ def residual_scale(residuals):  # pragma: no cover - compiled
 def correspond(source, level, T, limits):  # pragma: no cover - compiled
     """Rows of points [M], of the planes nearest to them [M], and distances [M] in sigmas."""
     points, normals = source
-    size, keys, rows, planes = level
+    planes = level[3]
     found_points = np.empty(len(points), np.int64)
     found_planes = np.empty(len(points), np.int64)
     residuals = np.empty(len(points))
@@ -76,7 +76,7 @@ def correspond(source, level, T, limits):  # pragma: no cover - compiled
         nx = T[0, 0] * mx + T[0, 1] * my + T[0, 2] * mz
         ny = T[1, 0] * mx + T[1, 1] * my + T[1, 2] * mz
         nz = T[2, 0] * mx + T[2, 1] * my + T[2, 2] * mz
-        row = _nearest_plane(x, y, z, nx, ny, nz, size, keys, rows, planes, limits[0])
+        row = _nearest_plane((x, y, z), (nx, ny, nz), level, limits[0])
         if row < 0:
             continue
         q = planes[row]
@@ -89,10 +89,11 @@ def correspond(source, level, T, limits):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _nearest_plane(  # noqa: PLR0913 - compiled
-    x, y, z, nx, ny, nz, size, keys, rows, planes, min_cosine
-):  # pragma: no cover - compiled
+def _nearest_plane(point, normal, level, min_cosine):  # pragma: no cover - compiled
     """Row of the nearest plane that faces as the point does, within a voxel's side; -1: none."""
+    x, y, z = point
+    nx, ny, nz = normal
+    size, keys, rows, planes = level
     cell_x, step_x, reach_x = _cell_and_neighbour(x, size)
     cell_y, step_y, reach_y = _cell_and_neighbour(y, size)
     cell_z, step_z, reach_z = _cell_and_neighbour(z, size)
@@ -150,11 +151,13 @@ def _axes(x, y, z):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def accumulate(source, level, T, limits, found, width, with_signal):  # noqa: PLR0913 - compiled
+def accumulate(source, level, at, found, with_signal):  # pragma: no cover - compiled
     """Normal equations with the Geman-McClure weight, and what of H the normals of both say.
 
-    That signal stays zero unless it is asked for.
+    `at` is the pose T_world_camera, the limits and the kernel's width. The signal stays zero unless
+    it is asked for.
     """
+    T, limits, width = at
     points, normals = source
     planes = level[3]
     H, signal, b = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
@@ -166,7 +169,7 @@ def accumulate(source, level, T, limits, found, width, with_signal):  # noqa: PL
         gx = (T[0, 0] * q[3] + T[1, 0] * q[4] + T[2, 0] * q[5]) / sigma
         gy = (T[0, 1] * q[3] + T[1, 1] * q[4] + T[2, 1] * q[5]) / sigma
         gz = (T[0, 2] * q[3] + T[1, 2] * q[4] + T[2, 2] * q[5]) / sigma
-        _jacobian(p[0], p[1], p[2], gx, gy, gz, J)
+        _jacobian(p, (gx, gy, gz), J)
         weight = 1.0 / (1.0 + (residual / width) ** 2) ** 2
         for i in range(6):
             scaled = weight * J[i]
@@ -174,7 +177,7 @@ def accumulate(source, level, T, limits, found, width, with_signal):  # noqa: PL
             for j in range(i, 6):
                 H[i, j] += scaled * J[j]
         if with_signal:
-            _jacobian(p[0], p[1], p[2], m[0] / sigma, m[1] / sigma, m[2] / sigma, own)
+            _jacobian(p, (m[0] / sigma, m[1] / sigma, m[2] / sigma), own)
             for i in range(6):
                 for j in range(i, 6):
                     signal[i, j] += 0.5 * weight * (J[i] * own[j] + own[i] * J[j])
@@ -186,8 +189,10 @@ def accumulate(source, level, T, limits, found, width, with_signal):  # noqa: PL
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _jacobian(px, py, pz, gx, gy, gz, out):  # noqa: PLR0913 - compiled
+def _jacobian(p, g, out):  # pragma: no cover - compiled
     """Derivative by a camera twist of g . p, the world at rest."""
+    px, py, pz = p[0], p[1], p[2]
+    gx, gy, gz = g
     out[0], out[1], out[2] = gx, gy, gz
     out[3] = py * gz - pz * gy
     out[4] = pz * gx - px * gz

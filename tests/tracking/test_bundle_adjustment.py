@@ -112,17 +112,17 @@ def test_the_same_problem_gives_the_same_bits():
 
 
 def cost_at(problem: BundleProblem, poses: np.ndarray, points: np.ndarray) -> float:
+    return huber_cost((inverse(poses), points), seen_in(problem), FOCAL, 2.0)
+
+
+def seen_in(problem: BundleProblem) -> tuple[np.ndarray, ...]:
     p = problem
-    return huber_cost(
-        inverse(poses), points, p.camera_index, p.point_index, p.measured, p.sigmas, FOCAL, 2.0
-    )
+    return p.camera_index, p.point_index, p.measured, p.sigmas
 
 
 def gradients(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
-    p = problem
-    views = inverse(p.T_world_cameras)
-    arguments = (p.camera_index, p.point_index, p.measured, p.sigmas, FOCAL, 2.0)
-    _, _, _, bc, bp = linearise(views, p.points_world, *arguments)
+    state = (inverse(problem.T_world_cameras), problem.points_world)
+    _, _, _, bc, bp = linearise(state, seen_in(problem), FOCAL, 2.0)
     return 2.0 * bc, 2.0 * bp
 
 
