@@ -76,6 +76,12 @@ def rss_mb(pid: int) -> float:
     return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def cpu_s(pid: int) -> float:
+    """Processor time that a process of this machine has used, its threads together, seconds."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 @contextmanager
 def running_cluster(folder: Path, options: LaunchOptions | None = None) -> Iterator[Cluster]:
     """Start services whose maps and logs go into `folder`; they end with the context."""

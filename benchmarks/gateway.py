@@ -2,8 +2,10 @@
 
 `pointslam bench gateway`: 16 clients x 15 frames/s x 300 kB with trackers that take 5 ms, through
 a real gateway process and a router; one more client asks for poses over gRPC all the while. Tells
-replies lost, the latencies that clients see, and what memory the gateway gained. The clients have
-processes of their own, and each begins at a random moment of a frame's time.
+replies lost, the latencies that clients see, what memory the gateway gained, and the processor
+time that a frame took of the gateway, of the clients, and of the stand-ins with the router: what
+else the machine does changes latencies, and hardly these. The clients have processes of their own,
+and each begins at a random moment of a frame's time.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from typing import Any
 import grpc
 import numpy as np
 
-from benchmarks.cluster import rss_mb
+from benchmarks.cluster import cpu_s, rss_mb
 from benchmarks.local_gateway import LocalGateway, local_gateway
 from pointslam.client import Client, Session
 from shared.camera import Calibration, Camera, Intrinsics
@@ -96,8 +98,9 @@ def _session(index: int) -> str:
     return f"load-{index}"
 
 
-def stream_all(url: str, load: Load, indices: range) -> list[Seen]:
-    """Some of the clients, in a process of their own."""
+def stream_all(url: str, load: Load, indices: range) -> tuple[list[Seen], float]:
+    """What some of the clients saw, in a process of their own, and its processor time in s."""
+    start_s = time.process_time()
     everyone = {index: Seen() for index in indices}
     threads = [
         threading.Thread(target=stream, args=(url, load, *each)) for each in everyone.items()
@@ -106,7 +109,7 @@ def stream_all(url: str, load: Load, indices: range) -> list[Seen]:
         thread.start()
     for thread in threads:
         thread.join()
-    return list(everyone.values())
+    return list(everyone.values()), time.process_time() - start_s
 
 
 def ask_poses(address: str, load: Load) -> list[float]:
@@ -134,7 +137,7 @@ def measure(gateway: LocalGateway, load: Load) -> dict[str, Any]:
     spawn = multiprocessing.get_context("spawn")
     gc.freeze()  # trackers, mapper and router are in this process
     with ProcessPoolExecutor(_CLIENT_PROCESSES + 1, spawn, initializer=gc.freeze) as pool:
-        start = time.perf_counter()
+        start, start_cpu_s = time.perf_counter(), (cpu_s(gateway.pid), time.process_time())
         poses = pool.submit(ask_poses, gateway.grpc_address, load)
         streams = [
             pool.submit(stream_all, gateway.url, load, range(part, load.clients, _CLIENT_PROCESSES))
@@ -142,10 +145,17 @@ def measure(gateway: LocalGateway, load: Load) -> dict[str, Any]:
         ]
         time.sleep(min(_WARM_S + 3.0, load.seconds))
         before_mb = rss_mb(gateway.pid)
-        everyone = [seen for part in streams for seen in part.result()]
+        parts = [part.result() for part in streams]
         gained_mb = rss_mb(gateway.pid) - before_mb
         wall_s = time.perf_counter() - start
-        found = summary(load, everyone, wall_s) | {"gateway_mb_gained": gained_mb}
+        found = summary(load, [seen for part, _ in parts for seen in part], wall_s)
+        found["gateway_mb_gained"] = gained_mb
+        cpu = {
+            "gateway": cpu_s(gateway.pid) - start_cpu_s[0],
+            "clients": sum(seconds for _, seconds in parts),
+            "stand_ins": time.process_time() - start_cpu_s[1],
+        }
+        found |= {f"cpu_ms_{who}": 1e3 * used_s / found["frames"] for who, used_s in cpu.items()}
         return found | percentiles("pose_query_ms", poses.result())
 
 

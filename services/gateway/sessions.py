@@ -17,7 +17,7 @@ from services.gateway.dispatch import choose
 from services.gateway.metrics import QUEUE_AGE, SESSIONS, UNDELIVERED
 from services.gateway.owner import Fabric, open_existing, open_new
 from services.gateway.session import Session
-from shared import codec
+from shared import codec, heap
 from shared.bus import Keys
 from shared.camera import Calibration
 from shared.errors import (
@@ -124,13 +124,14 @@ class Sessions:
         return tuple(self._open.values())
 
     async def forget_idle(self) -> None:
-        """Keep memory bounded, for ever: what nobody uses is closed; `get` takes it up again."""
+        """Keep memory level, for ever: what nobody uses is closed; `get` takes it up again."""
         idle_s = self.fabric.config.session_idle_s
         while True:
             await asyncio.sleep(min(idle_s / 4, 15.0))
             for name, session in list(self._open.items()):
                 if session.is_idle(idle_s):
                     self._open.pop(name).close()
+            await asyncio.to_thread(heap.trim)
 
     def drain(self) -> None:
         """Be ready no longer, and let nothing that is asked wait for a mapper: we are ending."""

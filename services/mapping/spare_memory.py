@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
-
 from services.mapping.rasterizer.scratch import scratch
+from shared import heap
 
 
 def give_back() -> None:
-    """Let go of idle scratch arrays, and of the holes that glibc keeps between what is in use.
+    """Let go of idle scratch arrays, and of the heap's holes.
 
-    On house-sparse that is a quarter of a gigabyte, as much as a copy of the map takes. Other C
-    libraries have no `malloc_trim`.
+    On house-sparse that is a quarter of a gigabyte, as much as a copy of the map takes.
     """
     scratch().release()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    heap.trim()
