@@ -40,7 +40,7 @@ class AnchorConfig:
     min_depth_gap: float = 0.06  # is not covered
     carve_window_px: int = 5  # odd; all readings in it must be behind an anchor to carve it
     min_samples: int = 2  # depth samples in a voxel that make an anchor
-    fill_holes: bool = True  # seed pixels without depth too, at the depth around them
+    fill_holes: bool = True  # seed pixels without depth too, at the depth around them or behind it
 
     def __post_init__(self) -> None:
         _check_choice(self.gaussians, ("neural", "plain"), "anchors.gaussians")

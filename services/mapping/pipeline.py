@@ -34,6 +34,7 @@ from services.mapping.views.colour_fusion import fuse_colours
 from services.mapping.views.coverage import uncovered_pixels
 from services.mapping.views.exposure_fit import fitted_exposure
 from services.mapping.views.first_look import first_look, resized
+from services.mapping.views.guessed_depth import with_guesses
 from services.mapping.views.render import Drawn, Painter, to_images
 from services.mapping.views.render_cache import Moment
 from services.mapping.views.sightings import Sightings
@@ -125,6 +126,7 @@ class Mapper:
             carve(self.anchors, image, pose, config)
             is_uncovered = self._look_at(keyframe, image)
             landmarks, exposure = keyframe.landmarks_world, self.exposures.of(keyframe.frame.seq)
+            image = with_guesses(image, pose, self.sightings, self.views.all(), config)
             request = SeedRequest(image, pose, is_uncovered, landmarks, exposure)
             new = seed_anchors(request, self.anchors.keys(), config, self._rng)
             self.revision = keyframe.poses.revision

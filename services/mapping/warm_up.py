@@ -24,6 +24,7 @@ def warm_up() -> None:
     size = Intrinsics(32.0, 32.0, 15.5, 15.5, 32, 32)
     grey = np.full((32, 32, 3), 128, np.uint8)
     depth = np.full((32, 32), 1000, np.uint16)
+    depth[8:16, 8:16] = 0  # a hole to be filled
     frame = Frame(0, 0, encode_jpeg(grey), encode_depth(depth, DepthEncoding.RAW16))
     poses = KeyframePoses(1, np.zeros(1, np.int64), np.eye(4)[None])
     calibration = Calibration(Camera(size), depth_scale=1000.0)

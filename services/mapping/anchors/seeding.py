@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.anchors.anchor_map import FEATURES, NewAnchors
-from services.mapping.anchors.depth_fill import filled_depth
 from services.mapping.anchors.membership import is_among
 from services.mapping.anchors.voxels import centres, levels_at, sizes_m, voxel_keys
 from services.mapping.config import AnchorConfig
@@ -28,7 +27,7 @@ _COLOUR_MARGIN = 0.02  # logits of pure black and white would be infinite
 class SeedRequest:
     """A keyframe, and what of it the map lacks."""
 
-    image: RgbdImage
+    image: RgbdImage  # its depth is measured, or guessed where it should be seeded all the same
     T_world_camera: NDArray[np.float64]  # [4, 4]
     is_uncovered: NDArray[np.bool_]  # [H, W], pixels that the map does not explain
     landmarks_world: NDArray[np.float64]  # [L, 3], ORB points of the keyframe
@@ -131,16 +130,15 @@ def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generato
     """Uncovered pixels, and those in the voxels of landmarks, in random order inside a voxel."""
     image, camera = request.image, request.image.intrinsics
     gain, bias = request.exposure
-    depth_m = filled_depth(image.depth_m) if config.fill_holes else image.depth_m
     landmarks = _LandmarkVoxels.of(request, config)
     is_candidate = request.is_uncovered | landmarks.pixels(camera)
-    pixels = rng.permutation(np.flatnonzero(depth_m > 0.0))
+    pixels = rng.permutation(np.flatnonzero(image.depth_m > 0.0))
     # A sample stands for its whole pixel, whose centre is at the whole number.
     jitter = rng.uniform(-0.5, 0.5, (2, len(pixels)))
     kept = np.flatnonzero(is_candidate.ravel()[pixels])
     rows, columns = np.divmod(pixels[kept], camera.width)
     u, v = columns + jitter[0, kept], rows + jitter[1, kept]
-    depths = depth_m[rows, columns]
+    depths = image.depth_m[rows, columns]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1)
     points = transform(request.T_world_camera, rays * depths[:, None])
     levels = levels_at(depths, config)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import cv2
 import numba
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.rasterizer import View
+from services.mapping.views.overlap import share_inside
 from services.mapping.views.training_views import TrainingView
 from shared import se3
 from shared.camera import Calibration, Intrinsics
@@ -30,6 +31,7 @@ DEPTH_TOLERANCE_M = 0.007  # between the point and the measured surface; as a st
 DEPTH_TOLERANCE = 0.01  # of the depth, added
 UNMEASURED = 0.5  # the agreement with a pixel that has no depth
 MAX_KEYFRAMES = 16  # that are looked at for every pixel
+MAX_FACING = 64  # that are asked what they look through
 _COARSE_PX = 160  # width at which this is computed
 _PROBE_STRIDE = 12  # of coarse pixels, when keyframes are chosen
 _MILLIMETRES = 1000.0
@@ -59,6 +61,14 @@ class _Points:
 
     def every(self, index: NDArray[np.int64]) -> _Points:
         return _Points(self.world[index], self.is_drawn[index], self.camera_world)
+
+
+class CoarseDepths(NamedTuple):
+    """What keyframes measured, as kernels want it."""
+
+    T_camera_world: NDArray[np.float64]  # [K, 3, 4]
+    depths_mm: NDArray[np.uint16]  # [K, h, w]
+    camera: NDArray[np.float64]  # fx, fy, cx, cy of the whole image, then its pixels per coarse one
 
 
 class Sightings:
@@ -106,6 +116,23 @@ class Sightings:
         points = _Points(points_world.astype(np.float64), is_drawn, centre.copy())
         return self._weights(points, [keyframe])[0]
 
+    def facing(
+        self, points_world: NDArray[np.float64], keyframes: list[TrainingView]
+    ) -> list[TrainingView]:
+        """Of the keyframes, the `MAX_FACING` that have most of the points [P, 3] in their image."""
+        if len(keyframes) <= MAX_FACING:
+            return keyframes
+        shares = [share_inside(points_world, k.T_world_camera, self.camera) for k in keyframes]
+        best = np.argsort(-np.array(shares), kind="stable")[:MAX_FACING]
+        return [keyframes[i] for i in sorted(best.tolist())]
+
+    def coarse_depths(self, keyframes: list[TrainingView]) -> CoarseDepths:
+        """What keyframes measured, one or more."""
+        T = np.stack([se3.inverse(keyframe.T_world_camera)[:3] for keyframe in keyframes])
+        k = self.camera
+        depths = np.stack([self._depth_mm(keyframe) for keyframe in keyframes])
+        return CoarseDepths(T, depths, np.array([k.fx, k.fy, k.cx, k.cy, self._step], np.float64))
+
     def _best_keyframes(
         self, points: _Points, shape: tuple[int, ...], keyframes: list[TrainingView]
     ) -> list[TrainingView]:
@@ -121,15 +148,9 @@ class Sightings:
 
     def _weights(self, points: _Points, keyframes: list[TrainingView]) -> NDArray[np.float32]:
         """How well each keyframe saw each point, 0 to 1, [K, P]."""
-        depths = np.stack([self._depth_mm(keyframe) for keyframe in keyframes])
-        T = np.stack([se3.inverse(keyframe.T_world_camera) for keyframe in keyframes])
-        k, weights = self.camera, np.zeros((len(keyframes), len(points.world)), np.float32)
-        camera = np.array([k.fx, k.fy, k.cx, k.cy, self._step], np.float64)
-        weigh(
-            (points.world, points.is_drawn, points.camera_world),
-            (T[:, :3].copy(), depths, camera),
-            weights,
-        )
+        weights = np.zeros((len(keyframes), len(points.world)), np.float32)
+        drawn = points.world, points.is_drawn, points.camera_world
+        weigh(drawn, self.coarse_depths(keyframes), weights)
         return weights
 
     def _depth_mm(self, keyframe: TrainingView) -> NDArray[np.uint16]:
@@ -166,7 +187,7 @@ _TWO_VARIANCES = 2.0 * math.radians(ANGLE_DEG) ** 2
 def weigh(points, keyframes, weights):  # pragma: no cover - compiled
     """`weights` [K, P] of points (world [P, 3], drawn [P], camera [3]) in keyframes.
 
-    Keyframes are (T_camera_world [K, 3, 4], depths [K, h, w] in mm, (fx, fy, cx, cy, step)).
+    Keyframes are `CoarseDepths`.
     """
     world, is_drawn, eye = points
     T, depths, camera = keyframes
