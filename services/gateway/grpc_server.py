@@ -35,7 +35,6 @@ from shared.wire import (
 )
 
 _READINESS_S = 0.5
-_GRACE_S = 1.0
 _NAMES = [
     module.DESCRIPTOR.services_by_name[name].full_name
     for module, name in (
@@ -99,7 +98,7 @@ async def serve_grpc(sessions: Sessions, door: GrpcDoor) -> AsyncIterator[None]:
     finally:
         readiness.cancel()
         await healthy.enter_graceful_shutdown()
-        await server.stop(_GRACE_S)
+        await server.stop(sessions.fabric.config.drain_calls_s)
 
 
 def _options(max_message_bytes: int) -> list[tuple[str, int]]:

@@ -3,6 +3,8 @@
 import asyncio
 import io
 import json
+import multiprocessing
+import os
 import zipfile
 
 import cv2
@@ -12,6 +14,7 @@ import pytest
 
 from pointslam.client import AsyncClient, Client
 from services.gateway.path_renders.camera_path import orbit, smooth_path, timed_path, upward
+from services.gateway.path_renders.temporary import ProcessFolder
 from shared import se3
 from shared.errors import ConflictError, InputError, NotFoundError
 from shared.maps import JobState
@@ -238,3 +241,30 @@ def test_the_asynchronous_client_gets_the_file_in_pieces(gateway, tracked, tmp_p
     (tmp_path / "film").write_bytes(b"".join(asyncio.run(fetch())))
 
     assert pictures_in(tmp_path / "film") == (2, (48, 64, 3))
+
+
+def die_with_a_folder(parent):
+    folder = ProcessFolder(parent)
+    (folder.path / "half.webm").write_bytes(bytes(1000))
+    os._exit(9)  # as a kill does: nothing is cleared
+
+
+def test_what_a_process_left_that_died_is_cleared_by_the_next_and_nothing_else_is(tmp_path):
+    living = ProcessFolder(tmp_path)
+    process = multiprocessing.get_context("spawn").Process(
+        target=die_with_a_folder, args=(tmp_path,)
+    )
+    process.start()
+    process.join()
+    left = set(tmp_path.iterdir()) - {living.path}
+
+    following = ProcessFolder(tmp_path)
+
+    assert len(left) == 1
+    assert set(tmp_path.iterdir()) == {living.path, following.path}
+
+
+def test_a_folder_that_is_closed_is_gone(tmp_path):
+    ProcessFolder(tmp_path).close()
+
+    assert not list(tmp_path.iterdir())

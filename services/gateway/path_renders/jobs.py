@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import logging
 import os
-import tempfile
 import threading
 import uuid
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from typing import Any
 from services.gateway.config import GatewayConfig
 from services.gateway.map_queries import ask_render
 from services.gateway.path_renders.files import SUFFIXES, PictureFile, open_file
+from services.gateway.path_renders.temporary import ProcessFolder
 from services.gateway.path_renders.views import PathViews
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
@@ -103,7 +103,7 @@ class PathRenders:
     def __init__(self, sessions: Sessions) -> None:
         self._sessions = sessions
         self._config = sessions.fabric.config
-        self._folder = tempfile.TemporaryDirectory(prefix="pointslam-renders-")
+        self._folder = ProcessFolder()
         self._jobs: dict[str, PathRender] = {}
 
     def start(self, session: Session, views: PathViews) -> PathRenderStatus:
@@ -114,7 +114,7 @@ class PathRenders:
             UnavailableError: too many are, or are kept.
         """
         self.require_room(session)
-        job = PathRender(session, views, Path(self._folder.name))
+        job = PathRender(session, views, self._folder.path)
         self._jobs[job.status.job] = job
         job.task = asyncio.create_task(self._live(job))
         return job.status
