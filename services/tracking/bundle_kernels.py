@@ -15,8 +15,10 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _residuals(view, X, measured, sigmas, camera, y, r):  # noqa: PLR0913 - compiled
+def _residuals(view, X, observation, camera, out):  # pragma: no cover - compiled
     """Fill the camera point y [3] and the normalised residuals r [3]."""
+    measured, sigmas = observation
+    y, r = out
     for i in range(3):
         y[i] = view[i, 0] * X[0] + view[i, 1] * X[1] + view[i, 2] * X[2] + view[i, 3]
     z = max(y[2], 0.05)
@@ -34,9 +36,8 @@ def huber_cost(state, seen, camera, huber):  # pragma: no cover - compiled
     r = np.zeros(3)
     cost = 0.0
     for o in range(len(camera_index)):
-        _residuals(
-            views[camera_index[o]], points[point_index[o]], measured[o], sigmas[o], camera, y, r
-        )
+        view, X = views[camera_index[o]], points[point_index[o]]
+        _residuals(view, X, (measured[o], sigmas[o]), camera, (y, r))
         for error in (np.sqrt(r[0] * r[0] + r[1] * r[1]), abs(r[2])):
             cost += error * error if error < huber else huber * (2.0 * error - huber)
     return cost
@@ -61,7 +62,7 @@ def linearise(state, seen, camera, huber):  # noqa: C901  # pragma: no cover - c
     for o in range(len(camera_index)):
         k, l = camera_index[o], point_index[o]
         view = views[k]
-        _residuals(view, points[l], measured[o], sigmas[o], camera, y, r)
+        _residuals(view, points[l], (measured[o], sigmas[o]), camera, (y, r))
         error, depth_error = np.sqrt(r[0] * r[0] + r[1] * r[1]), abs(r[2])
         weights[0] = weights[1] = 1.0 if error < huber else huber / error
         weights[2] = 1.0 if depth_error < huber else huber / depth_error

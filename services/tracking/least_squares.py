@@ -89,8 +89,7 @@ def refine_pose(
             prior,
             T,
             camera,
-            config.huber_sigma,
-            config.iterations,
+            (config.huber_sigma, config.iterations),
         )
         is_inlier = _chi2(observations, T, camera) < config.outlier_chi2
     H, _, _ = linear_system(observations, is_inlier, T, camera, config)
@@ -137,9 +136,10 @@ def _chi2(
 
 @numba.njit(cache=True, nogil=True)
 def _minimise(  # noqa: PLR0913 - compiled
-    observations, is_used, prior, T, camera, huber, iterations
+    observations, is_used, prior, T, camera, limits
 ):  # pragma: no cover - compiled
-    """Levenberg-Marquardt."""
+    """Levenberg-Marquardt; limits are (Huber's threshold, iterations)."""
+    huber, iterations = limits
     T = T.copy()
     damping = 1e-6
     H, b, cost = _with_prior(observations, is_used, prior, T, camera, huber)
@@ -203,7 +203,7 @@ def _accumulate(  # noqa: C901 - compiled
         if y[2] < 0.05:
             continue
         _reprojection_rows(y, pixels[n], sigmas[n], camera, r, J)
-        _plane_row(y, m, pixels[n], depths[n], camera, r, J)
+        _plane_row((y, m), pixels[n], depths[n], camera, (r, J))
         r[2] /= depth_sigmas[n]
         for i in range(6):
             J[2, i] /= depth_sigmas[n]
@@ -233,34 +233,38 @@ def _reprojection_rows(y, pixel, sigma, camera, r, J):  # noqa: PLR0913 - compil
     for k in range(2):
         r[k] = (camera[k] * y[k] / z + camera[2 + k] - pixel[k]) / sigma
     a, b = camera[0] / z / sigma, camera[1] / z / sigma
-    _row(a, 0.0, -a * y[0] / z, y[0], y[1], z, J[0])
-    _row(0.0, b, -b * y[1] / z, y[0], y[1], z, J[1])
+    _row((a, 0.0, -a * y[0] / z), (y[0], y[1], z), J[0])
+    _row((0.0, b, -b * y[1] / z), (y[0], y[1], z), J[1])
 
 
 @numba.njit(cache=True, nogil=True)
-def _plane_row(y, normal, pixel, depth, camera, r, J):  # noqa: PLR0913 - compiled
+def _plane_row(landmark, pixel, depth, camera, out):  # pragma: no cover - compiled
     """Row 2, metres: the measured point's distance from the landmark's plane.
 
     Where no normal is known it is the difference in depth; without depth it is nothing.
     """
+    y, normal = landmark
+    r, J = out
     nx, ny, nz = normal[0], normal[1], normal[2]
     if depth <= 0.0:
         r[2] = 0.0
-        _row(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, J[2])
+        _row((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), J[2])
     elif nx * nx + ny * ny + nz * nz < 0.5:
         r[2] = y[2] - depth
-        _row(0.0, 0.0, 1.0, y[0], y[1], y[2], J[2])
+        _row((0.0, 0.0, 1.0), (y[0], y[1], y[2]), J[2])
     else:
         mx = (pixel[0] - camera[2]) / camera[0] * depth
         my = (pixel[1] - camera[3]) / camera[1] * depth
         r[2] = nx * (y[0] - mx) + ny * (y[1] - my) + nz * (y[2] - depth)
         # The plane stands still in the world: the measured point is what turns with the camera.
-        _row(nx, ny, nz, mx, my, depth, J[2])
+        _row((nx, ny, nz), (mx, my, depth), J[2])
 
 
 @numba.njit(cache=True, nogil=True)
-def _row(gx, gy, gz, x, y, z, out):  # noqa: PLR0913 - compiled
-    """Derivative by a camera twist of g . p, where p moves by -(rho + phi x (x, y, z))."""
+def _row(g, p, out):  # pragma: no cover - compiled
+    """Derivative by a camera twist of g . p, where p = (x, y, z) moves by -(rho + phi x p)."""
+    gx, gy, gz = g
+    x, y, z = p
     out[0], out[1], out[2] = -gx, -gy, -gz
     out[3] = gy * z - gz * y
     out[4] = gz * x - gx * z
