@@ -176,17 +176,19 @@ def test_a_live_session_holds_its_frames_while_the_map_has_no_owner(
     disk = gateway.mapper.disk
     gateway.mapper.leave()
 
-    replies = [session.track(rgb, depth, (i + 2) * SECOND) for i in range(3)]
+    replies = []
+    while len(replies) < 3 or replies[-1].map_problem is None:
+        replies.append(session.track(rgb, depth, (len(replies) + 2) * SECOND))
 
     assert {reply.status for reply in replies} == {TrackingStatus.TRACKED}
-    assert replies[-1].map_problem is not None
     assert "no owner" in replies[-1].map_problem.reason
     with open_bus([gateway.router], PATIENT_BUS) as bus:
         StandInMapper(bus, "mapper-1", disk)
         session.wait_until_mapped()
-        assert session.track(rgb, depth, 5 * SECOND).map_problem is None
+        assert session.track(rgb, depth, 1000 * SECOND).map_problem is None
         session.wait_until_mapped()
-        assert [e.record.seq for e in disk[session.name].entries] == [0, 1, 2, 3, 4]
+        recorded = [entry.record.seq for entry in disk[session.name].entries]
+        assert recorded == list(range(len(replies) + 2))
 
 
 def test_a_router_that_starts_again_brings_everything_back(calibration, rgb, depth):

@@ -17,13 +17,14 @@ def owner_of(cluster, name):
         return client.session(name).info()["mapper"]
 
 
-def save(cluster, name):
-    """Asks for a snapshot whose owner will not live to answer."""
+def save(cluster, name, is_killed):
+    """Asks for one snapshot after the other, until their owner did not live to answer."""
     with Client(cluster.url) as client:
-        try:
-            client.session(name).save()
-        except PointSlamError:
-            return
+        while not is_killed.is_set():
+            try:
+                client.session(name).save()
+            except PointSlamError:
+                return
 
 
 def test_a_mapper_killed_twice_once_in_a_snapshot_loses_no_keyframe(
@@ -33,10 +34,12 @@ def test_a_mapper_killed_twice_once_in_a_snapshot_loses_no_keyframe(
         name = next(iter(players))
         time.sleep(moment_s)
         first = owner_of(cluster, name)
-        saving = threading.Thread(target=save, args=(cluster, name), daemon=True)
+        is_killed = threading.Event()
+        saving = threading.Thread(target=save, args=(cluster, name, is_killed), daemon=True)
         saving.start()
         wait_for(lambda: any((data_folder / name).glob("snapshot-*.tmp")))
         cluster.kill(first)
+        is_killed.set()
         cluster.start(first)
         second = owner_of(cluster, name)
         cluster.kill(second)
