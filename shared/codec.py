@@ -10,9 +10,10 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import msgpack
@@ -27,6 +28,7 @@ _DTYPES = {"<f4", "<f8", "|u1", "<u2", "<i4", "<i8", "|b1"}
 _MAX_AXES = 4
 _MAX_SMALL = 64  # elements of a list or map of `unpack_fields`
 _MAX_ELEMENTS = 1 << 20  # of a list or map; arrays are not limited by this
+_PLAIN = {bytes, str, int, float, bool, types.NoneType, np.ndarray}
 
 
 def pack(message: object) -> bytes:
@@ -79,8 +81,11 @@ def unpack_fields(data: bytes, names: tuple[str, ...]) -> dict[str, Any]:
 
 def to_plain(value: Any) -> Any:
     """Dataclasses as dictionaries; arrays stay arrays (see `to_json`)."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if (names := _names(kind)) is not None:
+        return {name: to_plain(getattr(value, name)) for name in names}
     if isinstance(value, StrEnum):
         return str(value)
     if isinstance(value, tuple | list):
@@ -159,30 +164,44 @@ def _fields(kind: type) -> dict[str, tuple[Any, bool]]:
     }
 
 
+@cache
+def _names(kind: type) -> tuple[str, ...] | None:
+    """A dataclass's fields; None of any other type."""
+    if not dataclasses.is_dataclass(kind):
+        return None
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
 def _convert(kind: Any, value: Any, where: str) -> Any:
+    return _converter(kind)(value, where)
+
+
+@cache
+def _converter(kind: Any) -> Callable[[Any, str], Any]:
+    """How values of a type are read: looked at once, as every frame has dozens of them."""
     origin = typing.get_origin(kind)
     if dataclasses.is_dataclass(kind):
-        return _convert_dataclass(typing.cast(type, kind), value, where)
+        return partial(_convert_dataclass, typing.cast(type, kind))
     if origin in (typing.Union, types.UnionType):
-        return _convert_optional(typing.get_args(kind), value, where)
+        return partial(_convert_optional, typing.get_args(kind))
     if origin is tuple:
-        return _convert_tuple(typing.get_args(kind), value, where)
+        return partial(_convert_tuple, typing.get_args(kind))
     if origin is dict:
-        return _convert_dict(typing.get_args(kind), value, where)
+        return partial(_convert_dict, typing.get_args(kind))
     if origin is np.ndarray:
-        return _convert_array(kind, value, where)
+        return partial(_convert_array, np.dtype(typing.get_args(typing.get_args(kind)[1])[0]))
     if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return _convert_enum(kind, value, where)
-    return _convert_scalar(kind, value, where)
+        return partial(_convert_enum, kind)
+    return partial(_convert_scalar, kind)
 
 
 def _convert_dataclass(kind: type, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise InputError(where, f"must be a map of fields, got {_name(value)}")
     fields = _fields(kind)
-    unknown = sorted(str(key) for key in value if key not in fields)
-    if unknown:
-        raise InputError(f"{where}.{unknown[0]}", f"unknown field; known are {', '.join(fields)}")
+    if unknown := value.keys() - fields.keys():
+        first = min(str(key) for key in unknown)
+        raise InputError(f"{where}.{first}", f"unknown field; known are {', '.join(fields)}")
     arguments = {}
     for name, (hint, is_required) in fields.items():
         if name in value:
@@ -211,8 +230,7 @@ def _convert_dict(options: tuple[Any, ...], value: Any, where: str) -> Any:
     return {str(key): _convert(options[1], item, f"{where}.{key}") for key, item in value.items()}
 
 
-def _convert_array(kind: Any, value: Any, where: str) -> np.ndarray:
-    dtype = np.dtype(typing.get_args(typing.get_args(kind)[1])[0])
+def _convert_array(dtype: np.dtype, value: Any, where: str) -> np.ndarray:
     if isinstance(value, list):
         try:
             value = np.asarray(value, dtype)
