@@ -1,9 +1,10 @@
 """Random scenes of every kind against the float64 reference."""
 
+import random
+
 import numpy as np
+import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from services.mapping.rasterizer import CpuRasterizer, Gaussians, View
 from services.mapping.rasterizer.reference import render
@@ -13,19 +14,22 @@ CAMERA = Intrinsics(fx=45.0, fy=50.0, cx=22.3, cy=19.8, width=47, height=41)
 VIEW = View(np.eye(4), CAMERA)
 
 # A coarse scale keeps a scene explainable; the seeded noise within it covers the rest.
-scenes = st.fixed_dictionaries(
-    {
-        "seed": st.integers(0, 2**20),
-        "size": st.integers(1, 60),
-        "nearest_m": st.sampled_from([-1.0, 0.19, 0.3, 1.0]),
-        "depth_range_m": st.sampled_from([0.02, 1.0, 5.0]),
-        "log_scale": st.sampled_from([-7.0, -4.0, -2.5, -1.0]),
-        "elongation": st.sampled_from([0.0, 0.7, 1.4]),
-        "thinness": st.sampled_from([1.0, 30.0, 1000.0]),
-        "opacity": st.sampled_from([(0.0, 0.01), (0.02, 0.9), (0.99, 0.999), (1.0, 1.0)]),
-        "spread": st.sampled_from([0.3, 1.0, 4.0]),
-    }
-)
+CHOICES = {
+    "size": range(1, 61),
+    "nearest_m": [-1.0, 0.19, 0.3, 1.0],
+    "depth_range_m": [0.02, 1.0, 5.0],
+    "log_scale": [-7.0, -4.0, -2.5, -1.0],
+    "elongation": [0.0, 0.7, 1.4],
+    "thinness": [1.0, 30.0, 1000.0],
+    "opacity": [(0.0, 0.01), (0.02, 0.9), (0.99, 0.999), (1.0, 1.0)],
+    "spread": [0.3, 1.0, 4.0],
+}
+
+
+def scene_of(number):
+    """One of many scenes, the same wherever and after whatever it is drawn."""
+    rng = random.Random(number)
+    return {"seed": number} | {name: rng.choice(choices) for name, choices in CHOICES.items()}
 
 
 def make(scene):
@@ -63,10 +67,7 @@ def differentiate(rendered, is_decided):
     total.backward()
 
 
-@given(scenes)
-@settings(
-    max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
-)
+@pytest.mark.parametrize("scene", [scene_of(number) for number in range(40)], ids=range(40))
 def test_any_scene_equals_the_reference_in_values_and_gradients(scene):
     tensors = make(scene)
     fast = [tensor.clone().requires_grad_() for tensor in tensors]
