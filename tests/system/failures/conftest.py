@@ -24,6 +24,8 @@ from shared.camera import Intrinsics
 SMALL = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 ROOM = SynthOptions(num_frames=40, num_views=1, noise=Noise.NONE, camera=SMALL)
 MAPPING = {"schedule": {"iterations_per_frame": 1}, "owner": {"lease_s": 2.0}}
+# Which frames are lost is asked here, not how long those that are not may take.
+GATEWAY = {"dispatch": {"live_wait_s": 60.0, "live_timeout_s": 60.0}}
 NUM_FRAMES = 45  # three seconds of play
 
 
@@ -53,7 +55,7 @@ def started(cluster_folder) -> Iterator[Cluster]:
         num_trackers=2,
         num_mappers=2,
         device="cpu",
-        settings=ServiceSettings({"mapping": MAPPING}),
+        settings=ServiceSettings({"mapping": MAPPING, "gateway": GATEWAY}),
     )
     with running_cluster(cluster_folder, options) as cluster:
         yield cluster
