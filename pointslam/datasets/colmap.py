@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from shared import se3
 from shared.camera import Camera, Intrinsics
 from shared.errors import InputError, SequenceError
 from shared.se3 import Matrix
+
+T = TypeVar("T")
 
 # COLMAP's number of the model, and how many parameters it has.
 _MODELS = {
@@ -43,17 +46,18 @@ def read_colmap(path: Path) -> ColmapModel:
     Raises:
         SequenceError: a file is absent or damaged, or of several or unknown cameras.
     """
-    suffix = "txt" if _is_text(path) else "bin"
-    read = (_camera_text, _poses_text) if suffix == "txt" else (_camera_binary, _poses_binary)
-    files = path / f"cameras.{suffix}", path / f"images.{suffix}"
-    return ColmapModel(_parse(files[0], read[0]), dict(_parse(files[1], read[1])))
+    if _is_text(path):
+        camera = _parse(path / "cameras.txt", _camera_text)
+        return ColmapModel(camera, _parse(path / "images.txt", _poses_text))
+    camera = _parse(path / "cameras.bin", _camera_binary)
+    return ColmapModel(camera, _parse(path / "images.bin", _poses_binary))
 
 
 def _is_text(path: Path) -> bool:
     return (path / "images.txt").is_file()
 
 
-def _parse(file: Path, read):
+def _parse(file: Path, read: Callable[[bytes], T]) -> T:
     try:
         return read(file.read_bytes())
     except OSError as error:
@@ -96,11 +100,11 @@ def _camera(model: str, size: tuple[int, int], parameters: list[float]) -> Camer
     return Camera(intrinsics, tuple(distortion), fisheye=model == "OPENCV_FISHEYE")
 
 
-def _poses_text(data: bytes) -> Iterator[tuple[str, Matrix]]:
+def _poses_text(data: bytes) -> dict[str, Matrix]:
     lines = [line for line in data.decode().splitlines() if not line.startswith("#")]
     while lines and not lines[0].strip():
         lines.pop(0)
-    return iter([_pose_of_line(line) for line in lines[::2] if line.strip()])  # then its points
+    return dict(_pose_of_line(line) for line in lines[::2] if line.strip())  # then its points
 
 
 def _pose_of_line(line: str) -> tuple[str, Matrix]:
@@ -108,17 +112,17 @@ def _pose_of_line(line: str) -> tuple[str, Matrix]:
     return words[9].strip(), _pose([float(word) for word in words[1:8]])
 
 
-def _poses_binary(data: bytes) -> Iterator[tuple[str, Matrix]]:
+def _poses_binary(data: bytes) -> dict[str, Matrix]:
     (count,) = struct.unpack_from("<Q", data)
-    at, poses = 8, []
+    at, poses = 8, dict[str, Matrix]()
     for _ in range(count):
         _, *values, _ = _IMAGE.unpack_from(data, at)
         at += _IMAGE.size
         end = data.index(b"\0", at)
-        poses.append((data[at:end].decode(), _pose(values)))
+        poses[data[at:end].decode()] = _pose(values)
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + points * _POINT_BYTES
-    return iter(poses)
+    return poses
 
 
 def _pose(values: list[float]) -> Matrix:
