@@ -97,7 +97,8 @@ def _begin(job: Job) -> TrackResult:
     request, observed = job.request, job.observed
     T = request.T_world_first
     enough = len(observed.cloud.points) >= job.config.keyframe.min_points
-    if not (request.frame.may_be_keyframe and enough):
+    is_first = request.prior is None  # a later one waits for the map to show what it began with
+    if not (is_first and request.frame.may_be_keyframe and enough):
         return _without_pose(job, TrackingStatus.NEED_FRAMES, T, -1)
     seq = request.frame.seq
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)

@@ -57,11 +57,12 @@ class ContextCache:
     def newest(self, session: str, reference_seq: int) -> LocalMap | None:
         """The most recently used map of a session, of what is near to a keyframe in any way.
 
-        If it can be, one that shows the keyframe: several cameras may be in one map.
+        If it can be, one that shows the keyframe: several cameras may be in one map. Never one from
+        before the map began: in that, any frame would be the first.
         """
         with self._lock:
             keys = [k for k in reversed(self._maps) if k[0] == session and not k[4]]
-            maps = [self._maps[key] for key in keys]
+            maps = [self._maps[k] for k in keys if self._maps[k].context.num_keyframes > 0]
         shown = (local for local in maps if _shows(local, reference_seq))
         return next(shown, maps[0] if maps else None)
 

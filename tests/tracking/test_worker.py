@@ -115,6 +115,25 @@ def test_a_live_frame_without_an_owner_is_tracked_in_the_last_neighbourhood(bus,
     np.testing.assert_allclose(result.T_world_camera, step(2), atol=2e-3)
 
 
+def test_a_map_that_was_empty_when_it_was_asked_for_is_no_neighbourhood_of_a_later_frame(
+    bus, session, room
+):
+    worker = Worker(bus, TrackingConfig(query_timeout_s=60.0))
+    stop = bus.serve(
+        Keys.session("test", 1, "context"),
+        ContextRequest,
+        lambda request: session.store.context(request.reference_seq),
+    )
+    worker.answer(session.request(room.frame(0, step(0))))  # the map begins with another's answer
+    stop()
+    session.track(room.frame(0, step(0)))
+    session.track(room.frame(1, step(1)))
+    later = dataclasses.replace(session.request(room.frame(2, step(2))), accepts_older_map=True)
+
+    with pytest.raises(UnavailableError):
+        worker.answer(later)
+
+
 def test_an_impossible_calibration_is_refused_by_name(bus, session, room):
     request = session.request(room.frame(0, np.eye(4)))
     camera = dataclasses.replace(room.intrinsics, fx=float("nan"))
