@@ -85,25 +85,28 @@ async def _serve(
     sessions = open_sessions(bus, config, name)
     forgetting = asyncio.create_task(sessions.forget_idle())
     server = _Server(_uvicorn_config(create_app(sessions, door.authority), config, door.tls))
-    loop = asyncio.get_running_loop()
+    asked_to_end = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, _drain, sessions, server, config.drain_notice_s)
+        asyncio.get_running_loop().add_signal_handler(number, asked_to_end.set)
+    draining = asyncio.create_task(_drain(asked_to_end, sessions, server))
     try:
         async with serve_grpc(sessions, door):
             await server.serve([listener])
     finally:
         forgetting.cancel()
+        draining.cancel()
         await sessions.close()
 
 
-def _drain(sessions: Sessions, server: _Server, notice_s: float) -> None:
-    """Be ready no longer, then close the door and finish what is under way."""
+async def _drain(asked_to_end: asyncio.Event, sessions: Sessions, server: _Server) -> None:
+    """Be ready no longer, let streams go with all their replies, then close the door."""
+    await asked_to_end.wait()
     sessions.drain()
-
-    def close_door() -> None:
-        server.should_exit = True
-
-    asyncio.get_running_loop().call_later(notice_s, close_door)
+    config = sessions.fabric.config
+    await asyncio.sleep(config.drain_notice_s)
+    # The server would cut them off in the middle.
+    await sessions.fabric.streams.finish(config.drain_streams_s)
+    server.should_exit = True
 
 
 def _uvicorn_config(app: FastAPI, config: GatewayConfig, tls: Tls | None) -> uvicorn.Config:

@@ -149,10 +149,11 @@ class GatewayConfig:
     session_idle_s: float = 600.0  # a session that nobody uses for so long is forgotten here
     path_keep_s: float = 600.0  # the file of a path render may be fetched for so long
     drain_notice_s: float = 0.5  # at SIGTERM: not ready for so long before the door closes,
-    drain_s: float = 4.0  # then so long for requests under way, and for what maps have not logged
+    drain_streams_s: float = 1.0  # then so long for the replies to frames that were taken,
+    drain_s: float = 3.0  # so long for requests under way, and for what maps have not logged,
     drain_calls_s: float = 1.0  # and so long for calls over gRPC
 
     @property
     def ends_within_s(self) -> float:
-        """How long after SIGTERM the last of it ends: notice, requests, calls, then the maps."""
-        return self.drain_notice_s + 2.0 * self.drain_s + self.drain_calls_s
+        """How long after SIGTERM the last of it ends: notice, streams, requests, calls, maps."""
+        return self.drain_notice_s + self.drain_streams_s + 2.0 * self.drain_s + self.drain_calls_s

@@ -7,20 +7,25 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Protocol
 
-from services.gateway.config import StreamConfig
 from services.gateway.decode import UNKNOWN
 from services.gateway.errors import detail
 from services.gateway.frame_queue import Outcome
+from services.gateway.owner import Fabric
 from services.gateway.session import Session
 from services.gateway.usage import Usage
 from shared.errors import PointSlamError
 from shared.stream import FrameMessage, FrameReply
 
 LOGGER = logging.getLogger(__name__)
+ENDING = "this gateway is ending: connect again"
 
 
 class SlowClientError(Exception):
     """The client does not read its replies."""
+
+
+class EndingError(Exception):
+    """This gateway is ending: every frame that it took is answered, and no more are taken."""
 
 
 class FrameSink(Protocol):
@@ -63,11 +68,13 @@ class FrameStream:
     def __init__(
         self,
         sink: FrameSink,
-        config: StreamConfig,
+        fabric: Fabric,
         send: Callable[[FrameReply], Awaitable[None]],
     ) -> None:
         self._sink = sink
         self._send = send
+        config = fabric.config.stream
+        self._ending = fabric.streams.ending
         self._timeout_s = config.send_timeout_s
         self._room = asyncio.Semaphore(config.live_unanswered if sink.is_live else config.credit)
         self._answers: asyncio.Queue[tuple[int, int, asyncio.Future[Outcome]] | None]
@@ -79,18 +86,22 @@ class FrameStream:
 
         Raises:
             SlowClientError: the client did not read for too long.
+            EndingError: the gateway ends before the client does.
         """
         writer = asyncio.create_task(self._write())
         reader = asyncio.create_task(self._read(read))
+        ending = asyncio.create_task(self._ending.wait())
         try:
             with self._sink.usage.held():
-                await asyncio.wait({writer, reader}, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({writer, reader, ending}, return_when=asyncio.FIRST_COMPLETED)
+            if not (writer.done() or reader.done()):
+                await self._finish(reader, writer)
             if not writer.done():
                 reader.result()
             await writer
         finally:
-            reader.cancel()
-            writer.cancel()
+            for task in (reader, writer, ending):
+                task.cancel()
 
     async def put(
         self, read: Callable[[], FrameMessage], numbers: Callable[[], tuple[int, int]]
@@ -120,6 +131,13 @@ class FrameStream:
             raise error
 
         await self.put(fail, lambda: (UNKNOWN, UNKNOWN))
+
+    async def _finish(self, reader: asyncio.Task[None], writer: asyncio.Task[None]) -> None:
+        reader.cancel()
+        await asyncio.wait({reader})  # what it was about to put is not taken
+        self._answers.put_nowait(None)
+        await writer
+        raise EndingError
 
     async def _read(self, read: Callable[[FrameStream], Awaitable[None]]) -> None:
         await read(self)

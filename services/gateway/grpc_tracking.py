@@ -11,6 +11,8 @@ import grpc
 from services.gateway.access.caller import current_caller
 from services.gateway.decode import UNKNOWN, check_frame
 from services.gateway.frame_stream import (
+    ENDING,
+    EndingError,
     FrameSink,
     FrameStream,
     SessionFrames,
@@ -85,10 +87,14 @@ class TrackingService(tracking_service_pb2_grpc.TrackingServiceServicer):
             return localized_to(await session.localize(message))
 
     async def _serve(self, sink: FrameSink, send: Send, read: Read, context: Any) -> None:
-        try:
-            await FrameStream(sink, self._sessions.fabric.config.stream, send).run(read)
-        except SlowClientError:
-            await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "replies are not read")
+        fabric = self._sessions.fabric
+        with fabric.streams.joined():
+            try:
+                await FrameStream(sink, fabric, send).run(read)
+            except SlowClientError:
+                await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "replies are not read")
+            except EndingError:
+                await context.abort(grpc.StatusCode.UNAVAILABLE, ENDING)
 
 
 @dataclass(frozen=True)

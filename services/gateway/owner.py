@@ -16,6 +16,7 @@ from services.gateway.dispatch import TrackerPool
 from services.gateway.events import EventKind, SessionEvents
 from services.gateway.members import Members
 from services.gateway.metrics import TAKEOVERS
+from services.gateway.open_streams import OpenStreams
 from shared.bus import Bus, Keys
 from shared.errors import (
     ConflictError,
@@ -51,6 +52,7 @@ class Fabric:
     config: GatewayConfig
     name: str = "gateway"
     ending: asyncio.Event = field(default_factory=asyncio.Event)  # nobody waits for a mapper now
+    streams: OpenStreams = field(default_factory=OpenStreams)
 
 
 class MapOwner:

@@ -11,15 +11,17 @@ from starlette.types import Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from services.gateway.access.caller import current_caller
-from services.gateway.config import StreamConfig
 from services.gateway.decode import plain, read_frame, read_numbers
 from services.gateway.errors import MESSAGE
 from services.gateway.frame_stream import (
+    ENDING,
+    EndingError,
     FrameSink,
     FrameStream,
     SessionFrames,
     SlowClientError,
 )
+from services.gateway.owner import Fabric
 from services.gateway.problems import problem_response
 from services.gateway.session import Session
 from services.gateway.sessions import Sessions
@@ -30,6 +32,7 @@ from shared.errors import InputError, PointSlamError
 from shared.stream import FrameMessage, FrameReply
 
 _POLICY_VIOLATION = 1008
+_SERVICE_RESTART = 1012
 _MAX_TEXT = 4096  # characters of a calibration
 
 
@@ -48,14 +51,14 @@ def websocket_routes(sessions: Sessions) -> APIRouter:
     async def stream(websocket: WebSocket, name: str) -> None:
         if (session := await _accepted(websocket, name, sessions)) is not None:
             door = _Door(websocket, SessionFrames(session), session.calibration)
-            await door.serve(sessions.fabric.config.stream)
+            await door.serve(sessions.fabric)
 
     @router.websocket("/v1/sessions/{name}/watch")
     async def watch(websocket: WebSocket, name: str) -> None:
         if (session := await _accepted(websocket, name, sessions)) is not None:
             with session.watchers.joined(session.usage) as watcher:
                 door = _WatchersDoor(websocket, watcher, watcher.calibration)
-                await door.serve(sessions.fabric.config.stream)
+                await door.serve(sessions.fabric)
 
     return router
 
@@ -78,14 +81,17 @@ class _Door:
         self._sink = sink
         self.calibration = calibration
 
-    async def serve(self, config: StreamConfig) -> None:
-        """Until the client goes, or does not read."""
-        try:
-            await FrameStream(self._sink, config, self._send).run(self._read)
-        except WebSocketDisconnect:
-            return
-        except SlowClientError:
-            await _cut(self._websocket)
+    async def serve(self, fabric: Fabric) -> None:
+        """Until the client goes, or does not read, or this gateway ends."""
+        with fabric.streams.joined():
+            try:
+                await FrameStream(self._sink, fabric, self._send).run(self._read)
+            except WebSocketDisconnect:
+                return
+            except SlowClientError:
+                await _close(self._websocket, _POLICY_VIOLATION, "replies are not read")
+            except EndingError:
+                await _close(self._websocket, _SERVICE_RESTART, ENDING)
 
     async def _read(self, frames: FrameStream) -> None:
         while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
@@ -137,9 +143,9 @@ def _device(text: str) -> Calibration:
     return device.calibration
 
 
-async def _cut(websocket: WebSocket) -> None:
+async def _close(websocket: WebSocket, code: int, reason: str) -> None:
     try:
         async with asyncio.timeout(0.5):
-            await websocket.close(_POLICY_VIOLATION, "replies are not read")
+            await websocket.close(code, reason)
     except (TimeoutError, WebSocketDisconnect):
         return  # it does not read the closing either

@@ -29,7 +29,7 @@ def bus(gateway):
         yield bus
 
 
-async def send_and_vanish(session, messages, config):
+async def send_and_vanish(session, messages, fabric):
     """Send frames and be gone, whatever is answered."""
 
     async def read(frames):
@@ -41,14 +41,14 @@ async def send_and_vanish(session, messages, config):
         raise VanishedError
 
     with pytest.raises(VanishedError):
-        await FrameStream(SessionFrames(session), config.stream, send).run(read)
+        await FrameStream(SessionFrames(session), fabric, send).run(read)
 
 
 async def wave(sessions, calibration, messages):
     """Sessions whose clients vanish and that are deleted then: weak references to them."""
-    config = sessions.fabric.config
     opened = [await sessions.create(CreateRequest(calibration)) for _ in range(CLIENTS)]
-    await asyncio.gather(*[send_and_vanish(session, messages, config) for session in opened])
+    fabric = sessions.fabric
+    await asyncio.gather(*[send_and_vanish(session, messages, fabric) for session in opened])
     for session in opened:
         await sessions.delete(session.name)
     return [weakref.ref(part) for session in opened for part in (session, session.owner)]

@@ -25,7 +25,10 @@ SMALL = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 ROOM = SynthOptions(num_frames=40, num_views=1, noise=Noise.NONE, camera=SMALL)
 MAPPING = {"schedule": {"iterations_per_frame": 1}, "owner": {"lease_s": 2.0}}
 # Which frames are lost is asked here, not how long those that are not may take.
-GATEWAY = {"dispatch": {"live_wait_s": 60.0, "live_timeout_s": 60.0}}
+GATEWAY = {
+    "dispatch": {"live_wait_s": 60.0, "live_timeout_s": 60.0},
+    "drain_streams_s": 60.0,
+}
 NUM_FRAMES = 45  # three seconds of play
 
 

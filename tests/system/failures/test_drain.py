@@ -66,7 +66,7 @@ def test_a_gateway_is_ready_no_longer_before_its_door_closes_and_no_watcher_hold
 ):
     with local_gateway() as other:
         ports = (free_port(), free_port())
-        settings = ("drain_notice_s=5.0",)
+        settings = ("drain_notice_s=10.0",)
         with gateway_process(other.router, ports, *settings) as process:
             url = f"http://127.0.0.1:{ports[0]}"
             with Client(url) as client:
