@@ -89,7 +89,8 @@ class Session:
         client = self._client
         route = Route(self._stream_here, self.trajectory, client.turn, len(client.gateways))
         for reply in resuming(frames, route):
-            self.next_seq = max(self.next_seq, reply.seq + 1)
+            if reply.seq >= self.next_seq:  # never backwards: `frames` counts in another thread
+                self.next_seq = reply.seq + 1
             yield reply
 
     def _stream_here(self, frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
