@@ -109,6 +109,7 @@ class StandInTracker:
         self.images.append(request)
         del self.images[:-100]
         time.sleep(self.delay_s)
+        self.may_answer.wait()
         return located(request)
 
 

@@ -25,6 +25,7 @@ def trackers(gateway):
     yield gateway.trackers
     for tracker in gateway.trackers:
         tracker.delay_s, tracker.decodes, tracker.status = 0.0, False, TrackingStatus.TRACKED
+        tracker.may_answer.set()
 
 
 @pytest.fixture

@@ -1,11 +1,13 @@
 """Frame streams over WebSocket: order, credit, superseding, what live and offline promise."""
 
 import dataclasses
-import time
+import re
 
+import httpx
 import msgpack
 import pytest
 
+from benchmarks.cluster import wait_for
 from pointslam.client import Client
 from pointslam.client.frame_stream import open_stream
 from shared import codec
@@ -16,15 +18,26 @@ from shared.stream import FrameReply
 SECOND = 1_000_000_000
 
 
-def frames(session, rgb, depth, count, pause_s=0.0):
+def frames(session, rgb, depth, count):
     for i in range(count):
-        time.sleep(pause_s)
         yield session.frame(rgb, depth, (i + 1) * SECOND)
 
 
-def slow_down(trackers, delay_s):
-    for tracker in trackers:
-        tracker.delay_s = delay_s
+def frames_before_the_first_answer(session, gateway, rgb, depth, count):
+    """All but the first and the last are superseded; to be used with `trackers`."""
+    before = superseded(gateway)
+    for tracker in gateway.trackers:
+        tracker.may_answer.clear()
+    yield from frames(session, rgb, depth, count)
+    wait_for(lambda: superseded(gateway) == before + count - 2)
+    for tracker in gateway.trackers:
+        tracker.may_answer.set()
+
+
+def superseded(gateway):
+    page = httpx.get(f"{gateway.url}/metrics").text
+    count = re.search(r'pointslam_frames_total\{outcome="SUPERSEDED"\} (\S+)', page)
+    return float(count[1]) if count else 0.0
 
 
 def test_every_frame_of_an_offline_stream_is_tracked_in_order(offline, rgb, depth):
@@ -35,26 +48,23 @@ def test_every_frame_of_an_offline_stream_is_tracked_in_order(offline, rgb, dept
 
 
 def test_a_live_stream_supersedes_all_but_the_newest_and_answers_in_order(
-    live, trackers, rgb, depth
+    gateway, live, trackers, rgb, depth
 ):
-    slow_down(trackers, 0.1)
-
-    replies = list(live.stream(frames(live, rgb, depth, 20, pause_s=0.01)))
+    replies = list(live.stream(frames_before_the_first_answer(live, gateway, rgb, depth, 20)))
 
     statuses = [reply.status for reply in replies]
     assert [reply.seq for reply in replies] == list(range(20))
     assert statuses[0] is statuses[-1] is TrackingStatus.TRACKED
-    assert statuses.count(TrackingStatus.SUPERSEDED) >= 10
+    assert set(statuses[1:-1]) == {TrackingStatus.SUPERSEDED}
 
 
 def test_superseded_frames_never_reach_the_map(gateway, live, trackers, rgb, depth):
-    slow_down(trackers, 0.1)
-    replies = list(live.stream(frames(live, rgb, depth, 10, pause_s=0.01)))
+    list(live.stream(frames_before_the_first_answer(live, gateway, rgb, depth, 10)))
     live.wait_until_mapped()
 
     recorded = [entry.record.seq for entry in gateway.mapper.disk[live.name].entries]
 
-    assert recorded == [r.seq for r in replies if r.status is TrackingStatus.TRACKED]
+    assert recorded == [0, 9]
 
 
 def test_a_stream_goes_on_after_a_refused_frame(offline, rgb, depth):
@@ -149,7 +159,6 @@ def test_a_stream_that_is_left_early_hurts_nobody(offline, rgb, depth):
     stream = offline.stream(frames(offline, rgb, depth, 100))
     next(stream)
     stream.close()
-    time.sleep(0.2)
 
     assert offline.track(rgb, depth, 1000 * SECOND).status is TrackingStatus.TRACKED
 
