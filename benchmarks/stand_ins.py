@@ -144,6 +144,10 @@ class StandInMapper:
         self.disk: dict[str, _Map] = {} if disk is None else disk
         self._bus = bus
         self._lock = threading.Lock()
+        self.opened: list[str] = []
+        self.was_asked = threading.Event()  # what sessions it has: somebody knows of it
+        self.may_answer = threading.Event()  # that it has opened a session
+        self.may_answer.set()
         self.leave = bus.close
         bus.serve(Keys.mapper(name, "open"), OpenRequest, self.open)
         bus.serve(Keys.mapper(name, "list"), Empty, self.list)
@@ -163,6 +167,8 @@ class StandInMapper:
             known.epoch += 1
             self.disk[request.session] = known
             self._serve(request.session, known)
+        self.opened.append(request.session)
+        self.may_answer.wait()
         return self._opening(request.session, known)
 
     def _opening(self, session: str, known: _Map) -> OpenReply:
@@ -199,6 +205,7 @@ class StandInMapper:
 
     def list(self, _: Empty) -> SessionList:
         """All sessions."""
+        self.was_asked.set()
         rows = [
             SessionSummary(name, 0, known.request.mode, len(known.keyframes()), True)
             for name, known in self.disk.items()

@@ -6,11 +6,12 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Any
 
+from services.gateway.create_request import CreateRequest
 from services.gateway.grpc_errors import refusing
 from services.gateway.map_queries import ask_render, export_pieces
 from services.gateway.pose_watch import correction, follow, watched
 from services.gateway.session import Session
-from services.gateway.sessions import CreateRequest, Sessions
+from services.gateway.sessions import Sessions
 from services.gateway.views import View, mean_confidence
 from services.gateway.wire_values import (
     calibration_from,

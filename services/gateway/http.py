@@ -14,11 +14,12 @@ from starlette.responses import JSONResponse, Response
 from services.gateway import examples
 from services.gateway.access.caller import current_caller
 from services.gateway.axes import Axes, in_axes
+from services.gateway.create_request import CreateRequest
 from services.gateway.decode import plain, read_frame, read_json
 from services.gateway.localizer import read_localize
 from services.gateway.pose_watch import correction
 from services.gateway.poses import TimedPose
-from services.gateway.sessions import CreateRequest, Sessions
+from services.gateway.sessions import Sessions
 from services.gateway.trajectory import fetch_trajectory, trajectory_file, trajectory_json
 from shared import codec
 from shared.errors import UnavailableError

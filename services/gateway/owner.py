@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -207,11 +207,16 @@ def largest_shift_m(old: KeyframePoses, new: KeyframePoses) -> float:
     return float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
 
+class UnansweredError(UnavailableError):
+    """A mapper that was asked for a session went silent: it may have it all the same."""
+
+
 async def open_new(fabric: Fabric, request: OpenRequest, mappers: Sequence[str]) -> OpenReply:
     """Create a session on the first of the mappers that has room and is well.
 
     Raises:
         InputError, ConflictError: the request cannot be met anywhere.
+        UnansweredError: nobody says that it has the session, and somebody did not answer.
         UnavailableError: no mapper could take it; says why.
     """
     return await _open_on_first(fabric, request, mappers, (UnavailableError, StorageError))
@@ -235,16 +240,23 @@ async def _open_on_first(
     mappers: Sequence[str],
     passed_over: tuple[type[PointSlamError], ...],
 ) -> OpenReply:
-    refusals = []
+    refusals: dict[str, PointSlamError] = {}
     timeout_s = fabric.config.mapping.open_timeout_s
     for mapper in mappers:
         try:
             return await fabric.bus.ask(Keys.mapper(mapper, "open"), request, OpenReply, timeout_s)
-        except passed_over as error:
-            refusals.append(f"{mapper}: {error}")
-    raise UnavailableError(
-        f"no mapper takes session {request.session} ({'; '.join(refusals) or 'none is alive'})"
-    )
+        except (*passed_over, ConflictError) as error:
+            refusals[mapper] = error
+            # Behind one that kept silent, a conflict may be with that one's session.
+            if not isinstance(error, passed_over) and not _is_one_silent(refusals):
+                raise
+    reasons = "; ".join(f"{mapper}: {error}" for mapper, error in refusals.items())
+    kind = UnansweredError if _is_one_silent(refusals) else UnavailableError
+    raise kind(f"no mapper takes session {request.session} ({reasons or 'none is alive'})")
+
+
+def _is_one_silent(refusals: Mapping[str, PointSlamError]) -> bool:
+    return any(isinstance(error, (GoneError, TimedOutError)) for error in refusals.values())
 
 
 async def ask_keyframes(fabric: Fabric, key: str) -> KeyframePoses:

@@ -9,57 +9,23 @@ from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakValueDictionary
 
-import numpy as np
-
-from services.gateway.access.tenants import SESSION_NAME, full_name, is_callers, public_name
-from services.gateway.decode import matrix_of
+from services.gateway.access.tenants import full_name, is_callers, public_name
+from services.gateway.create_request import CreateRequest
 from services.gateway.dispatch import choose
 from services.gateway.metrics import QUEUE_AGE, SESSIONS, UNDELIVERED
-from services.gateway.owner import Fabric, open_existing, open_new
+from services.gateway.owner import Fabric, UnansweredError, open_existing, open_new
 from services.gateway.session import Session
 from shared import codec, heap
 from shared.bus import Keys
-from shared.camera import Calibration
 from shared.errors import (
     ConflictError,
-    InputError,
+    GoneError,
     NotFoundError,
     PointSlamError,
     UnavailableError,
 )
 from shared.maps import DeleteRequest, Empty, MapInfo, PinRequest, SessionList
-from shared.se3 import Pose
 from shared.tracks import OpenReply, OpenRequest
-
-MODES = ("live", "offline")
-_MAX_SEED = 1 << 31
-
-
-@dataclass(frozen=True)
-class CreateRequest:
-    """What a client says to create a session."""
-
-    calibration: Calibration
-    name: str | None = None
-    mode: str = "live"
-    seed: int = 0
-    T_map_first: Pose | None = None
-
-    def check(self) -> None:
-        """Refuse what cannot be used with an InputError that names the field."""
-        self.calibration.check()
-        if self.name is not None and not SESSION_NAME.fullmatch(self.name):
-            raise InputError("name", "must be 1 to 64 letters, digits, '-' or '_'")
-        if self.mode not in MODES:
-            raise InputError("mode", f"must be one of {', '.join(MODES)}, got {self.mode[:40]!r}")
-        if not 0 <= self.seed < _MAX_SEED:
-            raise InputError("seed", f"must be 0 to {_MAX_SEED - 1}, got {self.seed}")
-
-    def T_world_first(self) -> np.ndarray:
-        """The pose of the first frame, [4, 4]."""
-        if self.T_map_first is None:
-            return np.eye(4)
-        return matrix_of(self.T_map_first, "T_map_first")
 
 
 @dataclass
@@ -94,7 +60,7 @@ class Sessions:
         async with self._lock_of(name):
             if name in self._open or await self._mapper_of(name) is not None:
                 raise ConflictError(f"session {public_name(name)} exists")
-            opened = await open_new(self.fabric, open_request, self._mappers_for(name))
+            opened = await self._make(open_request)
             self._open[name] = session = Session(self.fabric, opened)
         return session
 
@@ -175,11 +141,31 @@ class Sessions:
         mapper = session.owner.mapper if session else await self._mapper_of(name)
         if mapper is None:
             raise NotFoundError(f"no session {public_name(name)!r}")
-        timeout_s = self.fabric.config.mapping.question_timeout_s
-        key = Keys.mapper(mapper, "delete")
-        await self.fabric.bus.ask(key, DeleteRequest(name), Empty, timeout_s)
+        await self._delete_at(mapper, name)
         if self._open.pop(name, None) is not None and session is not None:
             session.close()
+
+    async def _delete_at(self, mapper: str, name: str) -> None:
+        """Ask until somebody has answered: a mapper that was gone before may have done it."""
+        mapping, was_unanswered = self.fabric.config.mapping, False
+        deadline = time.monotonic() + mapping.reopen_wait_s
+        while True:
+            key = Keys.mapper(mapper, "delete")
+            try:
+                await self.fabric.bus.ask(
+                    key, DeleteRequest(name), Empty, mapping.question_timeout_s
+                )
+                return
+            except NotFoundError:
+                if was_unanswered:
+                    return
+                raise
+            except GoneError:
+                if time.monotonic() > deadline:
+                    raise
+            was_unanswered = True
+            await asyncio.sleep(mapping.retry_s)
+            mapper = await self._mapper_of(name) or mapper
 
     async def pin(self, name: str, is_pinned: bool) -> None:
         """Keep a session whatever the mapper's rule of retention says, or no longer.
@@ -224,6 +210,16 @@ class Sessions:
 
     def _lock_of(self, name: str) -> asyncio.Lock:
         return self._opening.setdefault(name, asyncio.Lock())
+
+    async def _make(self, request: OpenRequest) -> OpenReply:
+        """A new map; or the one that a mapper made that was gone before it could say so."""
+        try:
+            return await open_new(self.fabric, request, self._mappers_for(request.session))
+        except UnansweredError as error:
+            try:
+                return await self._resume(request.session)
+            except NotFoundError:
+                raise error from None
 
     async def _resume(self, name: str) -> OpenReply:
         """The session from disk; waits while the lease of an owner that is gone runs out."""

@@ -167,6 +167,45 @@ def test_entries_that_a_gone_mapper_did_not_take_go_to_the_next_owner(gateway, s
         assert [e.record.seq for e in disk[session.name].entries] == list(range(6))
 
 
+def test_a_session_whose_mapper_was_gone_before_it_could_say_so_is_there_all_the_same(
+    gateway, client, calibration
+):
+    created = []
+    with open_bus([gateway.router], PATIENT_BUS) as bus:
+        mappers = (gateway.mapper, StandInMapper(bus, "mapper-1", gateway.mapper.disk))
+        wait_for(lambda: client.sessions() == [] and mappers[1].was_asked.is_set())
+        for mapper in mappers:
+            mapper.may_answer.clear()
+        creating = threading.Thread(
+            target=lambda: created.append(client.create_session(calibration))
+        )
+        creating.start()
+        wait_for(lambda: any(mapper.opened for mapper in mappers))
+        gone, other = sorted(mappers, key=lambda mapper: not mapper.opened)
+
+        gone.leave()
+        for mapper in mappers:
+            mapper.may_answer.set()
+        creating.join(60.0)
+
+        info = created[0].info()
+        assert (info["mapper"], info["epoch"]) == (other.name, 2)
+
+
+def test_a_session_is_deleted_by_a_mapper_that_comes_after_the_one_that_was_gone(
+    gateway, client, session
+):
+    disk = gateway.mapper.disk
+    gateway.mapper.leave()
+    deleting = threading.Thread(target=session.delete)
+    deleting.start()
+    with open_bus([gateway.router], PATIENT_BUS) as bus:
+        StandInMapper(bus, "mapper-1", disk)
+        deleting.join(60.0)
+
+    assert disk == {}
+
+
 def test_a_live_session_holds_its_frames_while_the_map_has_no_owner(
     gateway, client, calibration, rgb, depth
 ):

@@ -11,8 +11,8 @@ from pointslam.client.messages import frame_message
 from services.gateway.access.caller import CALLER, Caller
 from services.gateway.app import open_sessions
 from services.gateway.config import GatewayConfig
+from services.gateway.create_request import CreateRequest
 from services.gateway.frame_stream import FrameStream, SessionFrames
-from services.gateway.sessions import CreateRequest
 from shared.bus import open_bus
 
 WAVES, CLIENTS = 2, 20
