@@ -27,6 +27,7 @@ class Play:
     mode: str = "live"
     num_frames: int = 150
     rate_hz: float = 15.0
+    holds_last: bool = False  # the last frame waits until the player may end
 
     def t_ns(self, seq: int) -> int:
         """The stamp of a frame."""
@@ -85,6 +86,9 @@ class Player(threading.Thread):
         super().__init__(name=name, daemon=True)
         self.heard = Heard()
         self.failure: PointSlamError | None = None
+        self.may_end = threading.Event()
+        if not play.holds_last:
+            self.may_end.set()
         self._url = url
         self._play = play
 
@@ -110,6 +114,7 @@ class Player(threading.Thread):
         Raises:
             PointSlamError: the session could not be created, or not be taken up again.
         """
+        self.may_end.set()
         self.join(timeout_s)
         if self.failure is not None:
             raise self.failure
@@ -136,6 +141,8 @@ class Player(threading.Thread):
         start = time.monotonic()
         for seq in range(first, play.num_frames):
             time.sleep(max(0.0, start + (seq - first) / play.rate_hz - time.monotonic()))
+            if seq == play.num_frames - 1:
+                self.may_end.wait()
             image = play.sequence.frame(to_and_fro(seq, len(play.sequence)))
             self.heard.sent_s[seq] = time.monotonic()
             yield session.frame(image.rgb, image.depth, play.t_ns(seq))

@@ -26,6 +26,7 @@ from shared.replies import answer_query, read_reply
 LOGGER = logging.getLogger(__name__)
 
 _SEEN_WITHIN_S = 2.0
+_REFUSALS = 2
 
 
 def open_router(endpoint: str, config: RouterConfig | None = None) -> zenoh.Session:
@@ -53,12 +54,16 @@ def open_bus(endpoints: list[str], config: BusConfig | None = None, wait_s: floa
     config = config or BusConfig()
     settings = client_config(endpoints, config)
     deadline = time.monotonic() + wait_s
+    refusals = 0
     while True:
         try:
             return Bus(zenoh.open(settings), endpoints, config)
         except zenoh.ZError as error:
-            # zenoh has tried for seconds, and does not say why it was refused.
-            if present := answers(endpoints):
+            # zenoh has tried for seconds, and does not say why it was refused: once may be a
+            # machine that stood still meanwhile.
+            present = answers(endpoints)
+            refusals += bool(present)
+            if present and refusals == _REFUSALS:
                 raise UnavailableError(_refused(present, config)) from None
             if time.monotonic() > deadline:
                 raise UnavailableError(

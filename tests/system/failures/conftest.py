@@ -17,12 +17,14 @@ from pointslam.client import Client
 from pointslam.datasets import open_sequence
 from pointslam.datasets.base import Sequence
 from pointslam.launcher import LaunchOptions
-from pointslam.settings import ServiceSettings
+from pointslam.settings import ROLES, ServiceSettings
 from pointslam.synth import Noise, SynthOptions, record_scene
 from shared.camera import Intrinsics
 
 SMALL = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 ROOM = SynthOptions(num_frames=40, num_views=1, noise=Noise.NONE, camera=SMALL)
+# A machine that stands still for seconds breaks no connection; a frozen process is found dead.
+BUS = {"bus": {"lease_s": 10.0}}
 MAPPING = {"schedule": {"iterations_per_frame": 1}, "owner": {"lease_s": 2.0}}
 # Which frames are lost is asked here, not how long those that are not may take.
 GATEWAY = {
@@ -58,7 +60,9 @@ def started(cluster_folder) -> Iterator[Cluster]:
         num_trackers=2,
         num_mappers=2,
         device="cpu",
-        settings=ServiceSettings({"mapping": MAPPING, "gateway": GATEWAY}),
+        settings=ServiceSettings(
+            dict.fromkeys(ROLES, BUS) | {"mapping": BUS | MAPPING, "gateway": BUS | GATEWAY}
+        ),
     )
     with running_cluster(cluster_folder, options) as cluster:
         yield cluster
@@ -96,10 +100,12 @@ def streaming(cluster, recording, undisturbed, request):
         test = request.node.name.removeprefix("test_")[:40]
         modes = {f"{test}-offline-a": "offline", f"{test}-offline-b": "offline"}
         modes[f"{test}-live"] = "live"
-        plays = {name: Play(recording, mode, NUM_FRAMES) for name, mode in modes.items()}
+        plays = {
+            name: Play(recording, mode, NUM_FRAMES, holds_last=True) for name, mode in modes.items()
+        }
         players = play_all(cluster.url, plays)
         wait_for(lambda: all(player.heard.replies for player in players.values()))
-        yield players
+        yield players  # whatever happens happens before they end
         for name, player in players.items():
             assert_nothing_lost(cluster, name, player.finish(), undisturbed)
         with Client(cluster.url) as client:
