@@ -127,19 +127,34 @@ class Bus:
 
     async def ask(self, key: str, message: object, kind: type, timeout_s: float) -> Any:
         """`query` for asyncio; the event loop never blocks."""
+        return await self.question(key, message, kind, timeout_s)
+
+    def question(
+        self, key: str, message: object, kind: type, timeout_s: float
+    ) -> asyncio.Future[Any]:
+        """`ask` without a task: asked at once; the future brings what `ask` returns or raises."""
         loop = asyncio.get_running_loop()
-        answered: asyncio.Future[zenoh.Reply | None] = loop.create_future()
+        answered: asyncio.Future[Any] = loop.create_future()
+        replies: list[zenoh.Reply] = []
 
-        def settle(reply: zenoh.Reply | None) -> None:
+        def settle() -> None:
             if not answered.done():
-                answered.set_result(reply)
+                _settle(answered, replies, key, kind)
 
-        def put(reply: zenoh.Reply | None) -> None:
+        def wake() -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(settle, reply)
+                loop.call_soon_threadsafe(settle)
+
+        def hear(reply: zenoh.Reply) -> None:
+            replies.append(reply)
+            wake()
+
+        def end() -> None:
+            if not replies:  # a busy loop is woken once
+                wake()
 
         # indirect=False: run on zenoh's own thread instead of one new thread a call.
-        handler = zenoh.handlers.Callback(put, lambda: put(None), indirect=False)
+        handler = zenoh.handlers.Callback(hear, end, indirect=False)
         self._session.get(
             key,
             handler,
@@ -150,9 +165,7 @@ class Bus:
             priority=Keys.priority(key),
             timeout=timeout_s,
         )
-        if (reply := await answered) is None:
-            raise GoneError(f"nobody answers {key}")
-        return read_reply(reply, key, kind)
+        return answered
 
     def serve(
         self,
@@ -192,12 +205,21 @@ class Bus:
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
-    def subscribe(self, key: str, kind: type, receive: Callable[[Any], None]) -> Callable[[], None]:
-        """Call `receive` with each message; returns a function that stops it."""
+    def subscribe(
+        self,
+        key: str,
+        kind: type,
+        receive: Callable[[Any], None],
+        is_news: Callable[[bytes], bool] = lambda _: True,
+    ) -> Callable[[], None]:
+        """Call `receive` with each message that `is_news`; returns a function that stops it."""
 
         def handle(sample: zenoh.Sample) -> None:
+            data = sample.payload.to_bytes()
+            if not is_news(data):
+                return
             try:
-                receive(codec.unpack(kind, sample.payload.to_bytes()))
+                receive(codec.unpack(kind, data))
             except InputError as error:
                 LOGGER.warning("%s: dropped a publication: %s", key, error)
 
@@ -258,3 +280,14 @@ class Bus:
         """Names of a role's processes, as the routers know them now."""
         replies = self._session.liveliness().get(Keys.alive(role, "*"), timeout=3.0)
         return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
+
+
+def _settle(
+    answered: asyncio.Future[Any], replies: list[zenoh.Reply], key: str, kind: type
+) -> None:
+    try:
+        if not replies:
+            raise GoneError(f"nobody answers {key}")
+        answered.set_result(read_reply(replies[0], key, kind))
+    except Exception as error:  # whatever it is, it is for who waits
+        answered.set_exception(error)

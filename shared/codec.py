@@ -13,7 +13,7 @@ import typing
 from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import Any, TypeVar
 
 import msgpack
@@ -33,7 +33,7 @@ _PLAIN = {bytes, str, int, float, bool, types.NoneType, np.ndarray}
 
 def pack(message: object) -> bytes:
     """A dataclass as msgpack bytes."""
-    return _packb(to_plain(message))
+    return _packb(message)
 
 
 def unpack(kind: type[T], data: bytes) -> T:
@@ -99,8 +99,7 @@ def to_plain(value: Any) -> Any:
 
 def to_json(value: Any) -> Any:
     """Like `to_plain`, with arrays as nested lists: what `json.dumps` takes."""
-    plain = to_plain(value)
-    return _lists(plain)
+    return _lists(to_plain(value))
 
 
 def from_plain(kind: type[T], plain: Any, where: str = "") -> T:
@@ -109,11 +108,14 @@ def from_plain(kind: type[T], plain: Any, where: str = "") -> T:
     Raises:
         InputError: names the field that lacks, is unknown or has the wrong type.
     """
-    return _convert(kind, plain, where or kind.__name__)
+    try:
+        return _reader(kind)(plain)
+    except InputError as error:
+        raise _inside(where or kind.__name__, error) from None
 
 
-def _packb(plain: Any) -> bytes:
-    packed = msgpack.packb(plain, default=_pack_array, use_bin_type=True)
+def _packb(value: Any) -> bytes:
+    packed = msgpack.packb(value, default=_packable, use_bin_type=True)
     assert packed is not None
     return packed
 
@@ -128,14 +130,22 @@ def _lists(plain: Any) -> Any:
     return plain
 
 
-def _pack_array(value: Any) -> msgpack.ExtType:
+def _packable(value: Any) -> Any:
+    """What msgpack does not know itself, one level of it: it asks again for what is inside."""
     if isinstance(value, np.ndarray):
-        array = np.ascontiguousarray(value)
-        dtype = array.dtype.newbyteorder("<").str
-        assert dtype in _DTYPES, dtype
-        head = _packb([dtype, list(value.shape)])
-        return msgpack.ExtType(_ARRAY_CODE, head + array.tobytes())
+        return msgpack.ExtType(_ARRAY_CODE, _array_head(value.dtype, value.shape) + value.tobytes())
+    if (names := _names(type(value))) is not None:
+        return {name: getattr(value, name) for name in names}
+    if isinstance(value, np.generic):
+        return value.item()
     raise TypeError(f"cannot encode {type(value)}")
+
+
+@lru_cache(maxsize=256)
+def _array_head(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
+    name = dtype.newbyteorder("<").str
+    assert name in _DTYPES, name
+    return _packb([name, list(shape)])
 
 
 def _unpack_array(code: int, data: bytes) -> np.ndarray:
@@ -172,98 +182,118 @@ def _names(kind: type) -> tuple[str, ...] | None:
     return tuple(field.name for field in dataclasses.fields(kind))
 
 
-def _convert(kind: Any, value: Any, where: str) -> Any:
-    return _converter(kind)(value, where)
-
-
 @cache
-def _converter(kind: Any) -> Callable[[Any, str], Any]:
-    """How values of a type are read: looked at once, as every frame has dozens of them."""
-    origin = typing.get_origin(kind)
+def _reader(kind: Any) -> Callable[[Any], Any]:
+    """How values of a type are read; found out once, as every frame has dozens of them.
+
+    Readers raise InputErrors whose field is the way from the value that they were given.
+    """
+    origin, options = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
-        return partial(_convert_dataclass, typing.cast(type, kind))
+        return _dataclass_reader(typing.cast(type, kind))
     if origin in (typing.Union, types.UnionType):
-        return partial(_convert_optional, typing.get_args(kind))
+        return _optional_reader(options)
     if origin is tuple:
-        return partial(_convert_tuple, typing.get_args(kind))
+        return partial(_read_tuple, _reader(options[0]))
     if origin is dict:
-        return partial(_convert_dict, typing.get_args(kind))
+        return partial(_read_dict, _reader(options[1]))
     if origin is np.ndarray:
-        return partial(_convert_array, np.dtype(typing.get_args(typing.get_args(kind)[1])[0]))
+        return partial(_read_array, np.dtype(typing.get_args(options[1])[0]))
     if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return partial(_convert_enum, kind)
-    return partial(_convert_scalar, kind)
+        return partial(_read_enum, kind)
+    return partial(_read_scalar, kind)
 
 
-def _convert_dataclass(kind: type, value: Any, where: str) -> Any:
-    if not isinstance(value, dict):
-        raise InputError(where, f"must be a map of fields, got {_name(value)}")
-    fields = _fields(kind)
-    if unknown := value.keys() - fields.keys():
-        first = min(str(key) for key in unknown)
-        raise InputError(f"{where}.{first}", f"unknown field; known are {', '.join(fields)}")
-    arguments = {}
-    for name, (hint, is_required) in fields.items():
-        if name in value:
-            arguments[name] = _convert(hint, value[name], f"{where}.{name}")
-        elif is_required:
-            raise InputError(f"{where}.{name}", "is missing")
-    return kind(**arguments)
+def _dataclass_reader(kind: type) -> Callable[[Any], Any]:
+    fields = {
+        name: (_reader(hint), is_required) for name, (hint, is_required) in _fields(kind).items()
+    }
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            raise InputError("", f"must be a map of fields, got {_name(value)}")
+        if unknown := value.keys() - fields.keys():
+            first = min(str(key) for key in unknown)
+            raise InputError(f".{first}", f"unknown field; known are {', '.join(fields)}")
+        arguments, name = {}, ""
+        try:
+            for name, (read_field, is_required) in fields.items():
+                if name in value:
+                    arguments[name] = read_field(value[name])
+                elif is_required:
+                    raise InputError("", "is missing")
+        except InputError as error:
+            raise _inside(f".{name}", error) from None
+        return kind(**arguments)
+
+    return read
 
 
-def _convert_optional(options: tuple[Any, ...], value: Any, where: str) -> Any:
-    if value is None and types.NoneType in options:
-        return None
+def _inside(where: str, error: InputError) -> InputError:
+    return InputError(f"{where}{error.field}", error.reason)
+
+
+def _optional_reader(options: tuple[Any, ...]) -> Callable[[Any], Any]:
     (kind,) = (option for option in options if option is not types.NoneType)
-    return _convert(kind, value, where)
+    read = _reader(kind)
+    return lambda value: None if value is None else read(value)
 
 
-def _convert_tuple(options: tuple[Any, ...], value: Any, where: str) -> Any:
+def _read_tuple(read: Callable[[Any], Any], value: Any) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
-        raise InputError(where, f"must be a list, got {_name(value)}")
-    return tuple(_convert(options[0], item, f"{where}[{i}]") for i, item in enumerate(value))
+        raise InputError("", f"must be a list, got {_name(value)}")
+    items: list[Any] = []
+    try:
+        for item in value:
+            items.append(read(item))
+    except InputError as error:
+        raise _inside(f"[{len(items)}]", error) from None
+    return tuple(items)
 
 
-def _convert_dict(options: tuple[Any, ...], value: Any, where: str) -> Any:
+def _read_dict(read: Callable[[Any], Any], value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise InputError(where, f"must be a map, got {_name(value)}")
-    return {str(key): _convert(options[1], item, f"{where}.{key}") for key, item in value.items()}
+        raise InputError("", f"must be a map, got {_name(value)}")
+    items: dict[str, Any] = {}
+    key: Any = ""
+    try:
+        for key, item in value.items():
+            items[str(key)] = read(item)
+    except InputError as error:
+        raise _inside(f".{key}", error) from None
+    return items
 
 
-def _convert_array(dtype: np.dtype, value: Any, where: str) -> np.ndarray:
+def _read_array(dtype: np.dtype, value: Any) -> np.ndarray:
     if isinstance(value, list):
         try:
             value = np.asarray(value, dtype)
         except (ValueError, TypeError, OverflowError):
-            raise InputError(where, "must be numbers in rows of equal length") from None
+            raise InputError("", "must be numbers in rows of equal length") from None
     if not isinstance(value, np.ndarray):
-        raise InputError(where, f"must be an array, got {_name(value)}")
+        raise InputError("", f"must be an array, got {_name(value)}")
     if value.dtype != dtype:
-        raise InputError(where, f"must be an array of {dtype}, got {value.dtype}")
+        raise InputError("", f"must be an array of {dtype}, got {value.dtype}")
     return value
 
 
-def _convert_enum(kind: type[StrEnum], value: Any, where: str) -> StrEnum:
+def _read_enum(kind: type[StrEnum], value: Any) -> StrEnum:
     try:
         return kind(value)
     except ValueError:
         known = ", ".join(str(member) for member in kind)
-        raise InputError(where, f"must be one of {known}, got {str(value)[:40]!r}") from None
+        raise InputError("", f"must be one of {known}, got {str(value)[:40]!r}") from None
 
 
-def _convert_scalar(kind: Any, value: Any, where: str) -> Any:
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return _float(value, where)
-    if type(value) is not kind:
-        raise InputError(where, f"must be {kind.__name__}, got {_name(value)}")
-    return value
-
-
-def _float(value: int, where: str) -> float:
+def _read_scalar(kind: Any, value: Any) -> Any:
+    if type(value) is kind:
+        return value
+    if kind is not float or type(value) is not int:
+        raise InputError("", f"must be {kind.__name__}, got {_name(value)}")
     try:
         return float(value)
     except OverflowError:
-        raise InputError(where, "is too large a number") from None
+        raise InputError("", "is too large a number") from None
 
 
 def _name(value: Any) -> str:

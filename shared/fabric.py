@@ -22,6 +22,7 @@ from shared.errors import ConfigError
 MAX_MESSAGE_BYTES = 256 << 20
 PASSWORD_VARIABLE = "POINTSLAM_BUS_PASSWORD"
 _LINK_PROBE_S = 1.0
+_QUEUE_BATCHES = 16  # of 64 kB, for each connection and priority; zenoh takes no more
 _AUTH, _TLS = "transport/auth/usrpwd", "transport/link/tls"
 
 
@@ -127,6 +128,9 @@ def _common(mode: str, connect: list[str], listen: list[str], bus: BusConfig) ->
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": round(1e3 * bus.lease_s),
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # Room for a frame: who sends one waits for the link beyond it, were it an event loop.
+        "transport/link/tx/queue/size/data": _QUEUE_BATCHES,
+        "transport/link/tx/queue/size/data_low": _QUEUE_BATCHES,
     }
 
 

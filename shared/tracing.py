@@ -56,6 +56,9 @@ def span(name: str, traceparent: str = "", **attributes: str | int) -> Iterator[
 @contextmanager
 def under(traceparent: str) -> Iterator[None]:
     """Make a sender's span the present one; one that is no W3C traceparent changes nothing."""
+    if not traceparent:
+        yield
+        return
     token = context.attach(_PROPAGATOR.extract({_HEADER: traceparent}))
     try:
         yield

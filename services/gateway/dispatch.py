@@ -108,13 +108,14 @@ class TrackerPool:
                 if not race.workers or self._healthy() - failed - race.workers:
                     worker = await self._pick(session, failed, race.workers, deadline)
                     limit_s = self._limit_s(session, worker, limits)
-                    race.enter(worker, self._bus.ask(key_of(worker), request, kind, limit_s))
+                    question = self._bus.question(key_of(worker), request, kind, limit_s)
+                    race.enter(worker, question)
                     self._seats[session] = _Seat(worker, time.monotonic())
-                for worker, task in await race.ended(limits.patience_s):
-                    if self._has_answered(session, worker, task):
+                for worker, answer in await race.ended(limits.patience_s):
+                    if self._has_answered(session, worker, answer):
                         self._seats[session] = _Seat(worker, time.monotonic())
                         self._pass_over(session, race.silent(limits.patience_s))
-                        return task.result()
+                        return answer.result()
                     failed.add(worker)
         finally:
             race.close()
@@ -125,9 +126,9 @@ class TrackerPool:
             return max(limits.timeout_s, self._config.first_frame_timeout_s)
         return limits.timeout_s
 
-    def _has_answered(self, session: str, worker: str, task: asyncio.Task[Any]) -> bool:
+    def _has_answered(self, session: str, worker: str, answer: asyncio.Future[Any]) -> bool:
         """Whether a worker answered, if only to raise; one that did not loses its seat."""
-        error = task.exception()
+        error = answer.exception()
         if isinstance(error, GoneError):
             RETRIES.labels("gone").inc()
             LOGGER.warning("tracking worker %s is gone; asked by %s", worker, session)

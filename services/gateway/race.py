@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -15,24 +14,24 @@ class Race(Generic[T]):
 
     def __init__(self) -> None:
         self._since_s: dict[str, float] = {}
-        self._asked: dict[asyncio.Task[T], str] = {}
+        self._asked: dict[asyncio.Future[T], str] = {}
 
     @property
     def workers(self) -> set[str]:
         """Workers that were asked and have not ended."""
         return set(self._asked.values())
 
-    def enter(self, worker: str, question: Coroutine[Any, Any, T]) -> None:
-        """Ask one more worker."""
-        self._asked[asyncio.create_task(question)] = worker
+    def enter(self, worker: str, question: asyncio.Future[T]) -> None:
+        """One more worker, that was asked a question just now."""
+        self._asked[question] = worker
         self._since_s[worker] = time.monotonic()
 
-    async def ended(self, timeout_s: float) -> list[tuple[str, asyncio.Task[T]]]:
+    async def ended(self, timeout_s: float) -> list[tuple[str, asyncio.Future[T]]]:
         """Workers that have answered or failed; none when the time was over first."""
         done, _ = await asyncio.wait(
             self._asked, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED
         )
-        return [(self._asked.pop(task), task) for task in done]
+        return [(self._asked.pop(question), question) for question in done]
 
     def silent(self, longer_than_s: float) -> list[str]:
         """Workers that have had so much time and are still under way."""
@@ -41,6 +40,6 @@ class Race(Generic[T]):
 
     def close(self) -> None:
         """Wait for nobody any more."""
-        for task in self._asked:
-            task.cancel()
+        for question in self._asked:
+            question.cancel()
         self._asked.clear()

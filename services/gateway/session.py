@@ -23,6 +23,7 @@ from services.gateway.prior import next_prior, resumed_prior
 from services.gateway.tracker_question import TrackerQuestion
 from services.gateway.usage import Usage
 from services.gateway.watcher import Watchers
+from shared import codec
 from shared.bus import Keys
 from shared.errors import ClaimLostError, PointSlamError, UnavailableError
 from shared.frames import Frame, Prior, TrackRequest
@@ -219,8 +220,7 @@ class Session:
         reply = reply_of(result, {"queue": waited_ms, "gateway": total_ms})
         if self._delivery.holds_keyframe:
             reply = dataclasses.replace(reply, keyframe=False)  # it may be, but is not yet
-        problem = self._delivery.problem
-        if problem is not None:
+        if (problem := self._delivery.problem) is not None:
             reply = dataclasses.replace(reply, map_problem=detail(problem))
         self.live.show(frame, reply)
         return reply
@@ -239,7 +239,12 @@ class Session:
             if not loop.is_closed():
                 loop.call_soon_threadsafe(self._follow, news)
 
-        return self._fabric.bus.subscribe(Keys.advanced(self.owner.session), Advanced, heard)
+        key = Keys.advanced(self.owner.session)
+        return self._fabric.bus.subscribe(key, Advanced, heard, self._is_of_others)
+
+    def _is_of_others(self, data: bytes) -> bool:
+        """Whether an `Advanced` is not about our own frames, looked at before it is read."""
+        return self._claim == 0 or codec.unpack_fields(data, ("claim",)) != {"claim": self._claim}
 
     def _follow(self, news: Advanced) -> None:
         if news.claim > self._claim > 0:

@@ -1,6 +1,8 @@
 """One question asked of several workers."""
 
 import asyncio
+from collections.abc import Coroutine
+from typing import Any
 
 from services.gateway.race import Race
 
@@ -10,12 +12,16 @@ async def answer(event: asyncio.Event, value: str) -> str:
     return value
 
 
+def asked(question: Coroutine[Any, Any, str]) -> asyncio.Future[str]:
+    return asyncio.ensure_future(question)
+
+
 def test_the_first_to_answer_ends_it_and_the_silent_one_is_named():
     async def run():
         race, never, now = Race[str](), asyncio.Event(), asyncio.Event()
-        race.enter("silent", answer(never, "a"))
+        race.enter("silent", asked(answer(never, "a")))
         assert await race.ended(0.01) == []
-        race.enter("quick", answer(now, "b"))
+        race.enter("quick", asked(answer(now, "b")))
         now.set()
         ((worker, task),) = await race.ended(60.0)
         silent = race.silent(0.0)
@@ -31,7 +37,7 @@ def test_a_worker_that_failed_is_under_way_no_more():
 
     async def run():
         race = Race[str]()
-        race.enter("broken", fail())
+        race.enter("broken", asked(fail()))
         ((worker, task),) = await race.ended(60.0)
         return worker, str(task.exception()), race.workers
 
@@ -40,16 +46,10 @@ def test_a_worker_that_failed_is_under_way_no_more():
 
 def test_who_is_not_waited_for_is_cancelled():
     async def run():
-        race, never = Race[str](), asyncio.Event()
-        question = asyncio.create_task(answer(never, "a"))
-
-        async def forward() -> str:
-            return await question
-
-        race.enter("silent", forward())
+        race, question = Race[str](), asyncio.Future[str]()
+        race.enter("silent", question)
         await race.ended(0.01)
         race.close()
-        await asyncio.wait([question])
         return question.cancelled()
 
     assert asyncio.run(run())

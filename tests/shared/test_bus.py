@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from benchmarks.local_gateway import PATIENT_BUS, PATIENT_ROUTER, free_port
+from shared import codec
 from shared.bus import open_bus, open_router
 from shared.errors import (
     ConflictError,
@@ -211,6 +212,19 @@ def test_publications_reach_who_listens(bus, other):
 
     wait_for(publish)
     assert heard[0] == DeleteRequest("now")
+
+
+def test_publications_that_are_no_news_are_not_read(bus, other):
+    heard, old = [], codec.pack(DeleteRequest("old"))
+    other.subscribe("ps/test/news", DeleteRequest, heard.append, lambda data: data != old)
+
+    def publish():
+        bus.publish("ps/test/news", DeleteRequest("old"))
+        bus.publish("ps/test/news", DeleteRequest("new"))
+        return heard
+
+    wait_for(publish)
+    assert set(heard) == {DeleteRequest("new")}
 
 
 def test_a_publication_of_the_wrong_kind_is_dropped(bus, other):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shared import codec
 from shared.errors import InputError
-from shared.frames import ColourEncoding, ColourImage, TrackingStatus
+from shared.frames import ColourEncoding, ColourImage, DepthEncoding, TrackingStatus
 from shared.stream import DepthMessage, FrameMessage, FrameReply
 
 
@@ -53,6 +53,25 @@ def test_what_is_packed_comes_back(points):
         TrackingStatus.TRACKED,
         {"x": 1.0},
     )
+
+
+def test_only_fields_are_packed():
+    frame = FrameMessage(
+        1, 2, ColourImage(ColourEncoding.RGB8, b"rgb"), DepthMessage(DepthEncoding.RAW16, b"d")
+    ).frame()
+    before = codec.pack(frame)
+
+    frame.digest()  # is kept in the frame from here on
+
+    assert codec.pack(frame) == before
+
+
+def test_an_array_that_is_a_view_is_packed_as_it_reads():
+    points = np.arange(12, dtype=np.float32).reshape(3, 4).T[::2]
+
+    back = codec.unpack(Outer, codec.pack(example(points)))
+
+    np.testing.assert_array_equal(back.points, points)
 
 
 def test_json_carries_arrays_as_lists():
