@@ -103,18 +103,25 @@ class Session:
         """Follow a camera in this session's map, whoever else streams; the map does not change.
 
         Replies say LOST, without a pose, until the camera is found. Numbers and times need only
-        grow within this stream. As in `stream`, a live session's replies may say SUPERSEDED.
+        grow within this stream. As in `stream`, a live session's replies may say SUPERSEDED, and
+        where the client knows several gateways the next one finds the camera when one breaks.
 
         Args:
             frames: made by `frame`, or by any other means.
             device: what takes the images, where it is not the session's device.
 
         Raises:
-            UnavailableError: the connection broke; a new one must find the camera again.
+            UnavailableError: the connection broke.
         """
-        url = calls.watch_url(self._client.url, self.name)
-        target = StreamTarget(url, self._client.headers, calls.device_text(device))
-        return stream_frames(target, frames, self._under_way)
+        client = self._client
+
+        def watch_here(frames: Iterable[FrameMessage]) -> Iterator[FrameReply]:
+            url = calls.watch_url(client.url, self.name)
+            target = StreamTarget(url, client.headers, calls.device_text(device))
+            return stream_frames(target, frames, self._under_way)
+
+        # Who watches leaves no trace: what was not answered is asked again, all of it.
+        return resuming(frames, Route(watch_here, list, client.turn, len(client.gateways)))
 
     @property
     def _under_way(self) -> int | None:

@@ -147,7 +147,9 @@ def test_the_owner_takes_frames_of_the_newest_claim_only(gateways, calibration, 
     assert claim.number == entry.claim + 1
 
 
-def test_a_stream_goes_on_at_another_gateway_when_one_is_killed(calibration, rgb, depth):
+@pytest.fixture
+def doomed(calibration):
+    """A session at the first gateway of two, that gateway's process, and the one behind both."""
     with ExitStack() as stack:
         other = stack.enter_context(local_gateway(1, *PATIENCE))
         ports = (free_port(), free_port())
@@ -156,15 +158,48 @@ def test_a_stream_goes_on_at_another_gateway_when_one_is_killed(calibration, rgb
         client = stack.enter_context(Client(urls))
         wait_for(lambda: client.ready() and client.url == urls[0])
         session = client.create_session(calibration, mode="offline")
-        frames = [session.frame(rgb, depth, (i + 1) * SECOND) for i in range(12)]
+        yield client, session, process, other
 
-        replies = []
-        for reply in session.stream(frames):
-            replies.append(reply)
-            if reply.seq == 5:
-                process.kill()
 
-        assert [reply.seq for reply in replies] == list(range(12))
-        assert {str(reply.status) for reply in replies} == {"TRACKED"}
-        assert client.url == urls[1]
-        assert [record.seq for record in session.trajectory()] == list(range(12))
+def kill_amid(process, stream, frames):
+    """All replies of a stream whose gateway dies when some frames are answered, before the last."""
+    is_killed = threading.Event()
+
+    def gated():
+        yield from frames[:-1]
+        is_killed.wait(60.0)
+        yield frames[-1]
+
+    for reply in stream(gated()):
+        if reply.seq == frames[5].seq:
+            process.kill()
+            process.wait(60.0)
+            is_killed.set()
+        yield reply
+
+
+def test_a_stream_goes_on_at_another_gateway_when_one_is_killed(doomed, rgb, depth):
+    client, session, process, other = doomed
+    frames = [session.frame(rgb, depth, (i + 1) * SECOND) for i in range(12)]
+
+    replies = list(kill_amid(process, session.stream, frames))
+
+    assert [reply.seq for reply in replies] == list(range(12))
+    assert {str(reply.status) for reply in replies} == {"TRACKED"}
+    assert client.url == other.url
+    assert [record.seq for record in session.trajectory()] == list(range(12))
+
+
+def test_a_watcher_is_found_again_by_another_gateway_when_one_is_killed(doomed, rgb, depth):
+    client, session, process, other = doomed
+    stream(session, rgb, depth, [0, 1, 2])
+    frames = [session.frame(rgb, depth, (seq + 1) * SECOND) for seq in range(3, 15)]
+
+    replies = list(kill_amid(process, session.watch, frames))
+
+    asked = [r for r in other.trackers[0].requests if r.frame.seq > 2]
+    assert [reply.seq for reply in replies] == list(range(3, 15))
+    assert {str(reply.status) for reply in replies} == {"TRACKED"}
+    assert client.url == other.url
+    assert len([request for request in asked if request.prior is None]) == 2  # found twice
+    assert [record.seq for record in session.trajectory()] == [0, 1, 2]

@@ -1,10 +1,10 @@
-"""Owners of maps that die while a loop is closed: the map bends as ever, nothing of it is lost."""
+"""Loops that are closed while the map's owner dies, or while somebody watches."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import httpx
 import numpy as np
@@ -17,7 +17,8 @@ from pointslam.client.calls import TrajectoryRecord
 from pointslam.datasets.base import Sequence
 from shared.camera import Calibration, Camera, Intrinsics
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, DepthImage
-from shared.se3 import exp
+from shared.se3 import angle_rad, exp, inverse
+from shared.stream import FrameReply
 
 pytestmark = pytest.mark.system
 
@@ -26,6 +27,7 @@ HALF_SIDES_M = np.array([1.6, 1.2, 2.1])
 TURN = np.radians(8.0)
 COUNT = 46  # of 45 that are once around
 LOOP_SEQ = 41  # the first keyframe that is measured against the first of the map
+WATCHED_SEQ = 34  # of a keyframe that the loop moves by half a degree
 DEPTH_SCALE = 5000.0
 PATIENCE_S = 60.0
 
@@ -67,16 +69,17 @@ def cells(points: np.ndarray, size_m: float) -> np.ndarray:
 class OnceAround:
     """The turn, told with a focal length that is 1 % too long: it drifts, and its loop mends that.
 
-    Nothing after the keyframe that closes the loop is shown before `may_go_on`.
+    Nothing after frame `last_seq` is shown before `may_go_on`.
     """
 
     calibration = Calibration(
         Camera(replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)), DEPTH_SCALE
     )
 
-    def __init__(self, images: list[Image]) -> None:
+    def __init__(self, images: list[Image], last_seq: int = LOOP_SEQ) -> None:
         self.is_at_loop, self.may_go_on = threading.Event(), threading.Event()
         self._images = images
+        self._last_seq = last_seq
 
     def __len__(self) -> int:
         return len(self._images)
@@ -84,7 +87,7 @@ class OnceAround:
     def frame(self, index: int) -> Image:
         if index == LOOP_SEQ:
             self.is_at_loop.set()
-        if index > LOOP_SEQ:
+        if index > self._last_seq:
             self.may_go_on.wait(PATIENCE_S)
         return self._images[index]
 
@@ -107,8 +110,12 @@ def after(cluster, name: str) -> tuple[list[TrajectoryRecord], int]:
     """Records of every frame in the map as it is now, and how many loops the map has."""
     with Client(cluster.url) as client:
         records = client.session(name).trajectory()
-    keyframes = httpx.get(f"{cluster.url}/v1/sessions/{name}/keyframes").json()
-    return records, keyframes["loops"]
+    return records, keyframes(cluster, name)["loops"]
+
+
+def keyframes(cluster, name: str) -> dict[str, Any]:
+    """What the gateway knows of the keyframes now."""
+    return httpx.get(f"{cluster.url}/v1/sessions/{name}/keyframes", timeout=PATIENCE_S).json()
 
 
 def test_an_owner_killed_around_a_loop_closes_it_as_ever_and_loses_nothing(cluster):
@@ -138,3 +145,41 @@ def test_an_owner_killed_around_a_loop_closes_it_as_ever_and_loses_nothing(clust
     with Client(cluster.url) as client:
         for name in ("loop-calm", "loop-killed"):
             client.session(name).delete()
+
+
+def test_a_watcher_moves_with_the_map_when_a_loop_is_closed(cluster):
+    images = [view(index) for index in range(COUNT)]
+    sequence, found = OnceAround(images, last_seq=WATCHED_SEQ + 2), threading.Event()
+    player = start(cluster, "loop-watched", sequence)
+    wait_for(lambda: WATCHED_SEQ + 2 in player.heard.replies)
+
+    def around_the_loop():
+        yield images[WATCHED_SEQ]
+        found.wait(PATIENCE_S)
+        sequence.may_go_on.set()
+        player.finish()
+        wait_for(lambda: keyframes(cluster, "loop-watched")["loops"] >= 1)
+        yield images[WATCHED_SEQ + 1]
+
+    with Client(cluster.url) as client:
+        session = client.session("loop-watched")
+        replies = session.watch(
+            session.frame(image.rgb, image.depth, t_ns)
+            for t_ns, image in enumerate(around_the_loop(), start=1)
+        )
+        before = next(replies)
+        found.set()
+        (moved,) = replies
+        records = {record.seq: record for record in session.trajectory()}
+        session.delete()
+
+    there, next_to_it = records[WATCHED_SEQ], records[WATCHED_SEQ + 1]
+    assert turned_deg(before, there.T_map_camera_online) < 0.05
+    assert turned_deg(moved, next_to_it.T_map_camera_online) > 0.3
+    assert turned_deg(moved, next_to_it.T_map_camera_final) < 0.1
+
+
+def turned_deg(reply: FrameReply, T_map_camera: np.ndarray) -> float:
+    """The angle between what a watcher was told and a pose."""
+    assert reply.T_map_camera is not None
+    return float(np.degrees(angle_rad(inverse(T_map_camera) @ reply.T_map_camera.matrix())))
