@@ -67,6 +67,9 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--mode", choices=["offline", "live"], default="offline")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="live: times that of the recording"
+    )
     parser.add_argument("--max-frames", type=int, metavar="N")
     parser.add_argument("--refine", type=int, default=0, metavar="ITERATIONS")
     parser.add_argument("--holdout", type=int, default=8, metavar="K", help="0 holds none out")
@@ -85,6 +88,7 @@ def _run(arguments: argparse.Namespace) -> None:
         sequence=arguments.sequence,
         out=arguments.out,
         mode=arguments.mode,
+        speed=arguments.speed,
         max_frames=arguments.max_frames,
         refine=arguments.refine,
         holdout=arguments.holdout,

@@ -34,12 +34,14 @@ MODES = ("offline", "live")
 class RunOptions:
     """What to run, and how. Without `gateway` the services are started for the run.
 
-    `lpips_weights` is a safetensors file; without it metrics.json has null for LPIPS.
+    A live run plays the recording, `speed` times as fast as it was taken. `lpips_weights` is a
+    safetensors file; without it metrics.json has null for LPIPS.
     """
 
     sequence: Path
     out: Path
     mode: str = "offline"
+    speed: float = 1.0
     max_frames: int | None = None
     refine: int = 0
     holdout: int = 8
@@ -58,6 +60,8 @@ class RunOptions:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
         if self.holdout == 1:
             raise ConfigError("holdout 1 would keep every frame from training; 0 keeps none")
+        if self.speed <= 0 or (self.mode == "offline" and self.speed != 1.0):
+            raise ConfigError(f"speed must be positive, and 1 offline, got {self.speed}")
         if self.max_frames is not None and self.max_frames < 1:
             raise ConfigError(f"max_frames must be positive, got {self.max_frames}")
 
@@ -226,7 +230,7 @@ def _stream_and_map(
 ) -> tuple[StreamResult, _Mapped]:
     start = time.monotonic()
     count = min(len(sequence), options.max_frames or len(sequence))
-    stream = StreamOptions(count, options.holdout, options.mode == "live")
+    stream = StreamOptions(count, options.holdout, options.mode == "live", options.speed)
     streamed = stream_sequence(session, sequence, stream)
     with progress_bar("mapping", "frame") as progress:
         session.wait_until_mapped(progress)

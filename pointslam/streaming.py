@@ -26,6 +26,7 @@ class StreamOptions:
     num_frames: int
     holdout: int
     is_live: bool
+    speed: float = 1.0  # live: times that of the recording
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,6 @@ def _messages(
         frame = sequence.frame(index)
         if options.is_live:
             due_s = 1e-9 * (frame.t_ns - sequence.t_ns(0))
-            time.sleep(max(0.0, start + due_s - time.monotonic()))
+            time.sleep(max(0.0, start + due_s / options.speed - time.monotonic()))
         may_be_keyframe = not is_held_out(index, options.holdout)
         yield session.frame(frame.rgb, frame.depth, frame.t_ns, FrameOptions(may_be_keyframe))
