@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 class NoHelper(Executor):
@@ -18,3 +20,8 @@ class NoHelper(Executor):
         except Exception as error:  # handed on by result()
             future.set_exception(error)
         return future
+
+
+def taken_over(future: Future[T], work: Callable[[], T]) -> T:
+    """The result of a task; done here where its thread has not come to it yet."""
+    return work() if future.cancel() else future.result()

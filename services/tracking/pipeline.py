@@ -7,17 +7,19 @@ whichever worker gets the frame gives the same result to the bit.
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
 from services.tracking.estimate import Estimate, pose_covariance
-from services.tracking.executors import NoHelper
+from services.tracking.executors import NoHelper, taken_over
 from services.tracking.keyframes import (
     Coverage,
     KeyframeParts,
+    Sharpness,
     becomes_keyframe,
     is_too_blurred,
     is_well_known,
@@ -167,12 +169,15 @@ def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | No
     ids = estimate.landmark_ids(len(observed.features.octaves))
     observations = keyframe_observations(frame.seq, observed.features, ids)
     observations = with_moving(observations, observed.moving)
-    inspection = helper.submit(_inspect, job, estimate, coverage, observations)
+    loop_search = helper.submit(_loop, job, estimate, observations)
+    look = partial(_sharpness, job, estimate)
+    looking = helper.submit(look)
     data = _keyframe(job, estimate, observations)
-    inspected = inspection.result()
-    if inspected is None:
+    sharpness = taken_over(looking, look)  # the search for a loop may take longer than the window
+    loop = loop_search.result()
+    if is_too_blurred(sharpness, coverage, observed.intrinsics, config.keyframe):
         return None
-    return replace(data, edge_blur_px=inspected.edge_blur_px, loop=inspected.loop)
+    return replace(data, edge_blur_px=sharpness.edge_blur_px, loop=loop)
 
 
 def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> KeyframeData:
@@ -187,26 +192,16 @@ def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> Keyfr
     return replace(keyframe_data(parts, config.surface, config.keyframe), link=link)
 
 
-@dataclass(frozen=True)
-class _Inspected:
-    """What is found out about a keyframe while its window is adjusted."""
-
-    edge_blur_px: float
-    loop: LoopConstraint | None
-
-
-def _inspect(
-    job: Job, estimate: Estimate, coverage: Coverage, observations: Observations
-) -> _Inspected | None:
-    """Blur, and an earlier keyframe of the same place; None: too blurred for a keyframe."""
-    observed, config = job.observed, job.config.keyframe
+def _sharpness(job: Job, estimate: Estimate) -> Sharpness:
+    """How blurred a keyframe is beside those around."""
     with job.clock.stage("sharpness"):
-        sharpness = sharpness_of(observed.image, estimate.local.context.window)
-    if is_too_blurred(sharpness, coverage, observed.image.intrinsics, config):
-        return None
+        return sharpness_of(job.observed.image, estimate.local.context.window)
+
+
+def _loop(job: Job, estimate: Estimate, observations: Observations) -> LoopConstraint | None:
+    """An earlier keyframe of the same place."""
     with job.clock.stage("loop"):
-        loop = find_loop(job, estimate, observations)
-    return _Inspected(sharpness.edge_blur_px, loop)
+        return find_loop(job, estimate, observations)
 
 
 def _coverage(observed: Observed, estimate: Estimate) -> Coverage:

@@ -33,10 +33,8 @@ def edge_blur_px(rgb: NDArray[np.uint8]) -> float:
     coarse = cv2.GaussianBlur(fine, (11, 11), float(np.sqrt(_COARSE_PX**2 - _FINE_PX**2)))
     (fx, fy), (cx, cy) = gradients(fine), gradients(coarse)
     strength = cx * cx + cy * cy
-    is_edge = strength >= max(np.quantile(strength[::2, ::2], _STRONGEST), _MIN_GRADIENT**2)
-    is_edge &= strength >= _CREST * cv2.dilate(strength, np.ones((3, 3), np.uint8))
-    fx, fy, cx, cy = fx[is_edge], fy[is_edge], cx[is_edge], cy[is_edge]
-    ratios = np.sqrt((fx * fx + fy * fy) / strength[is_edge])
+    least = max(np.quantile(strength[::2, ::2], _STRONGEST), _MIN_GRADIENT**2)
+    cx, cy, ratios = _on_edges(strength, (fx, fy), (cx, cy), np.float32(least))
     directions = np.floor(np.arctan2(cy, cx) * (_DIRECTIONS / np.pi)).astype(np.int64) % _DIRECTIONS
     widths = [_width_px(ratios[directions == k]) for k in range(_DIRECTIONS)]
     return max(widths)
@@ -59,6 +57,35 @@ def gradients(image):  # pragma: no cover - compiled
             x[row, column] = b - a + 2 * across + d - c
             y[row, column] = c - a + 2 * (down - up) + d - b
     return x, y
+
+
+@numba.njit(cache=True, nogil=True)
+def _on_edges(strength, fine, coarse, least):  # pragma: no cover - compiled
+    """Coarse gradients (x, y) on the crests of edges, and the ratios of fine to coarse, [E] each.
+
+    `strength` [H, W] is the squared coarse gradient, `least` that of an edge.
+    """
+    height, width = strength.shape
+    x = np.empty(strength.size, np.float32)
+    y = np.empty(strength.size, np.float32)
+    ratios = np.empty(strength.size, np.float32)
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            here = strength[v, u]
+            if here < least:
+                continue
+            crest = here
+            for vv in range(max(v - 1, 0), min(v + 2, height)):
+                for uu in range(max(u - 1, 0), min(u + 2, width)):
+                    crest = max(crest, strength[vv, uu])
+            if here < np.float32(_CREST) * crest:
+                continue
+            fx, fy = fine[0][v, u], fine[1][v, u]
+            x[count], y[count] = coarse[0][v, u], coarse[1][v, u]
+            ratios[count] = np.sqrt((fx * fx + fy * fy) / here)
+            count += 1
+    return x[:count], y[:count], ratios[:count]
 
 
 def _width_px(ratios: NDArray[np.float32]) -> float:
