@@ -7,6 +7,7 @@ import torch
 
 from services.mapping import rasterizer
 from services.mapping.config import MappingConfig
+from services.mapping.keyframes import warm_up as keyframes
 from services.mapping.losses import ssim
 from services.mapping.pipeline import Mapper, NewKeyframe
 from shared.camera import Calibration, Camera, Intrinsics
@@ -21,6 +22,7 @@ def warm_up() -> None:
     torch.set_num_threads(1)
     rasterizer.warm_up()
     ssim.warm_up()
+    keyframes.warm_up()
     size = Intrinsics(32.0, 32.0, 15.5, 15.5, 32, 32)
     grey = np.full((32, 32, 3), 128, np.uint8)
     depth = np.full((32, 32), 1000, np.uint16)
