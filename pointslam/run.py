@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tarfile
 import tempfile
@@ -60,7 +61,7 @@ class RunOptions:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
         if self.holdout == 1:
             raise ConfigError("holdout 1 would keep every frame from training; 0 keeps none")
-        if self.speed <= 0 or (self.mode == "offline" and self.speed != 1.0):
+        if not 0.0 < self.speed < math.inf or (self.mode == "offline" and self.speed != 1.0):
             raise ConfigError(f"speed must be positive, and 1 offline, got {self.speed}")
         if self.max_frames is not None and self.max_frames < 1:
             raise ConfigError(f"max_frames must be positive, got {self.max_frames}")

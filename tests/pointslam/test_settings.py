@@ -43,8 +43,13 @@ def test_settings_that_nobody_has_are_refused(word):
 @pytest.mark.parametrize(
     "wrong",
     [
-        *({"mode": "fast"}, {"holdout": 1}, {"max_frames": 0}, {"refine": -1}),
-        *({"mode": "live", "speed": 0.0}, {"mode": "offline", "speed": 2.0}),
+        {"mode": "fast"},
+        {"holdout": 1},
+        {"max_frames": 0},
+        {"refine": -1},
+        {"mode": "live", "speed": 0.0},
+        {"mode": "live", "speed": float("nan")},
+        {"mode": "offline", "speed": 2.0},
     ],
 )
 def test_impossible_runs_are_refused(tmp_path, wrong):
