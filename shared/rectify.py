@@ -6,7 +6,7 @@ and evaluation all use this one, so that they see the same pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -26,6 +26,17 @@ class RgbdImage:
     rgb: NDArray[np.uint8]  # [H, W, 3]
     depth_m: NDArray[np.float32]  # [H, W], 0 where there is none
     intrinsics: Intrinsics
+    moving: NDArray[np.bool_] | None = None  # [H, W], pixels that are not to be looked at
+
+    def without(self, moving: NDArray[np.bool_]) -> RgbdImage:
+        """The image with no depth, and colours that do not count, at some pixels [H, W]."""
+        return replace(self, depth_m=np.where(moving, np.float32(0.0), self.depth_m), moving=moving)
+
+    def mean_colour(self) -> NDArray[np.floating]:
+        """Mean of the colours that count, 0 to 255, [3]; zero where none does."""
+        if self.moving is None:
+            return self.rgb.reshape(-1, 3).mean(0)
+        return self.rgb[~self.moving].sum(0) / max(1, np.count_nonzero(~self.moving))
 
 
 def rectify(frame: Frame, calibration: Calibration) -> RgbdImage:

@@ -124,6 +124,8 @@ class KeyframeData:
     edge_blur_px: float = 0.0  # standard deviation of the blur of its edges, 0 where unknown
     link: KeyframeLink | None = None  # None: the first keyframe, or one of an older log
     loop: LoopConstraint | None = None
+    # [H / 8, W / 8], `pixel_cells` of what moves otherwise than the map; None: nothing does
+    moving_cells: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from services.mapping.views.guessed_depth import with_guesses
 from services.mapping.views.render import Drawn, Painter, to_images
 from services.mapping.views.render_cache import Moment
 from services.mapping.views.sightings import Sightings
-from services.mapping.views.training_views import TrainingView, TrainingViews
+from services.mapping.views.training_views import MovingCells, TrainingView, TrainingViews
 from shared import se3
 from shared.camera import Calibration
 from shared.frames import Frame
@@ -57,6 +57,7 @@ class NewKeyframe:
     frame: Frame
     poses: KeyframePoses  # of all keyframes, this one included
     landmarks_world: NDArray[np.float64]  # [L, 3], ORB points that it saw
+    moving_cells: NDArray[np.bool_] | None = None  # of `KeyframeData`
 
     @property
     def T_world_camera(self) -> NDArray[np.float64]:
@@ -190,7 +191,7 @@ class Mapper:
         }
         return MapState(flatten(groups), values)
 
-    def restore(self, state: MapState, frames: Mapping[int, Frame]) -> None:
+    def restore(self, state: MapState, frames: Mapping[int, Frame], moving: MovingCells) -> None:
         """Take up a `state()`; `frames` has at least the keyframes that it names."""
         groups = unflatten(state.tensors)
         self.anchors.restore(groups["anchors"])
@@ -204,7 +205,7 @@ class Mapper:
         self.iterations = state.values["iterations"]
         self.revision = state.values["revision"]
         self._rng.bit_generator.state = state.values["generator"]
-        self.views.restore(state.values["views"], frames)
+        self.views.restore(state.values["views"], frames, moving)
 
     def _step(self, keyframe: TrainingView, rates: LearningRates, progress: float = 0.0) -> None:
         """One optimisation step on one keyframe, at 0 <= `progress` < 1 of a refinement."""
@@ -270,13 +271,13 @@ class Mapper:
                 self._placement.follow(seq, T_world_camera, self.anchors)
 
     def _add_view(self, keyframe: NewKeyframe) -> RgbdImage:
-        frame = keyframe.frame
-        view = TrainingView(frame.seq, frame.t_ns, frame, keyframe.T_world_camera)
+        frame, pose = keyframe.frame, keyframe.T_world_camera
+        view = TrainingView(frame.seq, frame.t_ns, frame, pose, keyframe.moving_cells)
         image = self.views.add(view)
         self.sightings.add(frame.seq, image)
-        self._placement.add(frame.seq, keyframe.T_world_camera)
+        self._placement.add(frame.seq, pose)
         self.exposures.add(frame.seq, frame.t_ns)
-        mean = image.rgb.reshape(-1, 3).mean(0) / np.float32(255.0)
+        mean = image.mean_colour() / np.float32(255.0)
         self._background += (mean - self._background) / len(self.views)
         return image
 

@@ -38,6 +38,7 @@ from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
 from shared.frames import TrackingStatus, TrackRequest
+from shared.pixel_cells import cells_of
 from shared.se3 import inverse
 from shared.tracks import (
     NO_LANDMARK,
@@ -189,7 +190,9 @@ def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> Keyfr
         correction = adjust_window(new, context, observed.intrinsics, config)
     parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
     link = KeyframeLink(context.reference_seq, context.revision, estimate.information)
-    return replace(keyframe_data(parts, config.surface, config.keyframe), link=link)
+    data = keyframe_data(parts, config.surface, config.keyframe)
+    cells = None if observed.is_moving is None else cells_of(observed.is_moving)
+    return replace(data, link=link, moving_cells=cells)
 
 
 def _sharpness(job: Job, estimate: Estimate) -> Sharpness:

@@ -178,6 +178,30 @@ def test_a_session_killed_after_a_snapshot_goes_on_to_the_same_map(open_session,
     assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
 
 
+def test_a_session_taken_up_leaves_out_what_moves_as_before(open_session, entry, tmp_path):
+    cells = np.zeros((9, 12), bool)
+    cells[3:7, 3:9] = True
+
+    def masked(seq):
+        made = entry(seq, is_keyframe=True)
+        return replace(made, keyframe=replace(made.keyframe, moving_cells=cells))
+
+    whole = open_session("whole")
+    for seq in (0, 4):
+        whole.advance(masked(seq))
+    whole.save()
+    shutil.copytree(tmp_path / "whole", tmp_path / "resumed")
+    whole.advance(masked(8))
+
+    resumed = open_session("resumed")
+    resumed.advance(masked(8))
+
+    expected, found = parameters(whole), parameters(resumed)
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+    views = resumed._worker.visit(lambda mapper: mapper.views.all())
+    assert [np.array_equal(view.moving_cells, cells) for view in views] == [True] * 3
+
+
 def test_a_session_resumes_from_the_log_alone(open_session, entry, tmp_path):
     session = open_session()
     for seq in range(6):

@@ -11,6 +11,7 @@ from services.tracking.stopwatch import Stopwatch
 from services.tracking.surfaces import surfaces_of
 from shared.frames import TrackingStatus
 from shared.free_space import seen_through
+from shared.pixel_cells import pixels_of
 from shared.se3 import exp, inverse
 from shared.tracks import MOVING
 
@@ -82,6 +83,19 @@ def test_what_goes_with_the_camera_is_remembered_as_moving(carried):
 
     last = [result.keyframe for result in results if result.keyframe is not None][-1]
     assert (last.observations.landmark_ids == MOVING).sum() >= MovingConfig().min_still
+
+
+def test_a_keyframe_tells_the_pixels_of_what_goes_with_the_camera(carried):
+    results, walk = carried
+
+    keyframes = [result.keyframe for result in results if result.keyframe is not None]
+    assert keyframes[0].moving_cells is None
+    size = walk.calibration.colour.intrinsics
+    for keyframe in keyframes[1:]:
+        if keyframe.observations.landmark_ids.min() <= MOVING:
+            mask = pixels_of(keyframe.moving_cells, size.height, size.width)
+            assert mask[size.height // 2, size.width // 2]
+            assert 0.3 < mask.mean() < 0.6
 
 
 def test_a_board_over_half_of_the_image_is_not_followed(room, session):

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from services.mapping.config import LossConfig
 from services.mapping.losses.kernels import PIECE, Images, Look, compare, compare_back
-from services.mapping.losses.mapping_loss import Appearance, Loss, Target
+from services.mapping.losses.mapping_loss import Appearance, Loss, Target, mapping_loss
 from services.mapping.rasterizer import Rendered
 from services.mapping.rasterizer.scratch import scratch
 from services.mapping.rasterizer.simd import LANES
@@ -28,6 +28,8 @@ def mapping_loss_cpu(
     rendered: Rendered, target: Target, appearance: Appearance, config: LossConfig
 ) -> Loss:
     """The same as `losses.mapping_loss`."""
+    if target.moving is not None:  # few keyframes are so: theirs may take longer
+        return mapping_loss(rendered, target, appearance, config)
     comparison = target, appearance.background.numpy(), config.max_depth_error_m
     image, colour, squared, depth = _Compare.apply(
         rendered.colour, rendered.depth, rendered.alpha, appearance.exposure, comparison

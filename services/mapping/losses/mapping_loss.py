@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,6 +25,8 @@ class Target:
     depth: Tensor  # [H, W], metres, 0 where there is none
     ssim: SsimTarget | None  # what comparisons on the CPU share
     intrinsics: Intrinsics
+    moving: Tensor | None = None  # [H, W], pixels that do not count
+    seen_share: float = 1.0  # of the pixels that do
 
     @staticmethod
     def of(image: RgbdImage, device: torch.device) -> Target:
@@ -32,13 +34,29 @@ class Target:
         colour = torch.from_numpy(image.rgb).to(device).float() / 255.0
         depth = torch.from_numpy(image.depth_m).to(device)
         shared = SsimTarget.of(colour) if device.type == "cpu" else None
-        return Target(colour, depth, shared, image.intrinsics)
+        target = Target(colour, depth, shared, image.intrinsics)
+        if image.moving is None:
+            return target
+        moving, seen_share = torch.from_numpy(image.moving).to(device), 1.0 - image.moving.mean()
+        return replace(target, ssim=None, moving=moving, seen_share=max(seen_share, 1e-6))
 
     def similarity(self, image: Tensor) -> Tensor:
         """Mean SSIM of an image [H, W, 3] with this one."""
-        if self.ssim is None:
+        if self.ssim is None and self.colour.device.type != "cpu":
             return ssim_torch(image, self.colour)
-        return ssim(image, self.ssim)
+        return ssim(image, self.ssim or self.colour)
+
+    def beside(self, image: Tensor) -> tuple[Tensor, Target]:
+        """A render and this target as they are compared, equal and constant where things move.
+
+        So these pixels have no error of their own, and the windows of SSIM that reach over them
+        see what the map draws there and not what moves.
+        """
+        if self.moving is None:
+            return image, self
+        moving, drawn = self.moving[..., None], image.detach()
+        colour = torch.where(moving, drawn, self.colour)
+        return torch.where(moving, drawn, image), replace(self, colour=colour)
 
 
 @dataclass(frozen=True)
@@ -67,13 +85,14 @@ def mapping_loss(
 ) -> Loss:
     """(1 - w) L1 + w (1 - SSIM) + depth L1, each a mean over the image's pixels."""
     image = appearance.apply(rendered.colour, rendered.alpha)
+    image, target = target.beside(image)
     error = image - target.colour
     total = (1.0 - config.ssim) * error.abs().mean()
     if config.ssim > 0:
         total = total + config.ssim * (1.0 - target.similarity(image))
     if config.depth > 0:
         total = total + config.depth * depth_error(rendered, target.depth, config)
-    return Loss(total, error.detach().square().mean())
+    return Loss(total, error.detach().square().mean() / target.seen_share)
 
 
 def depth_error(rendered: Rendered, depth: Tensor, config: LossConfig) -> Tensor:

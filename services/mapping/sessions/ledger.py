@@ -48,7 +48,15 @@ class Resumed:
     map: MapState | None = None
     refinement: JobStatus = JobStatus()
     frames: dict[int, Frame] = field(default_factory=dict)  # keyframes of the snapshot
+    moving: dict[int, NDArray[np.bool_]] = field(default_factory=dict)  # their `moving_cells`
     later: list[NewKeyframe | None] = field(default_factory=list)
+
+    def note(self, entry: Advance) -> None:
+        """Keep the images of an entry that the snapshot's map has."""
+        if entry.frame is not None and entry.keyframe is not None:
+            self.frames[entry.frame.seq] = entry.frame
+            if entry.keyframe.moving_cells is not None:
+                self.moving[entry.frame.seq] = entry.keyframe.moving_cells
 
 
 class Ledger:
@@ -79,8 +87,7 @@ class Ledger:
             for entry in read_log(folder.path / name, log_ends[name]):
                 if snapshot and len(self._records) < snapshot.entries:
                     self._note(entry)
-                    if entry.frame is not None:
-                        resumed.frames[entry.frame.seq] = entry.frame
+                    resumed.note(entry)
                 else:
                     resumed.later.append(self._apply(entry))
         return resumed
@@ -162,7 +169,8 @@ class Ledger:
             return None
         self._store.insert(record.seq, record.t_ns, record.T_world_camera, entry.keyframe)
         _, landmarks_world = self._store.landmarks_seen_by(record.seq)
-        return NewKeyframe(entry.frame, self._store.poses(), landmarks_world)
+        moving_cells = entry.keyframe.moving_cells
+        return NewKeyframe(entry.frame, self._store.poses(), landmarks_world, moving_cells)
 
     def _note(self, entry: Advance) -> None:
         self._records.append(entry.record)

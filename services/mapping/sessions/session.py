@@ -106,7 +106,7 @@ class Session:
     def _restore(self, mapper: Mapper, resumed: Resumed) -> None:
         assert resumed.map is not None
         try:
-            mapper.restore(resumed.map, resumed.frames)
+            mapper.restore(resumed.map, resumed.frames, resumed.moving)
         except (KeyError, RuntimeError, ValueError) as error:
             raise ConfigError(
                 f"the saved map of {self.record.session} does not fit this mapper's settings "

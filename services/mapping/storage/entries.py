@@ -30,6 +30,9 @@ def check_entry(entry: Advance) -> None:
         _check_shapes("prior", _shapes_of_prior(entry.prior))
     if entry.keyframe is not None:
         _check_shapes("keyframe", _shapes_of_keyframe(entry.keyframe))
+        cells = entry.keyframe.moving_cells
+        if cells is not None and cells.ndim != 2:
+            raise InputError("keyframe.moving_cells", f"must have two axes, got {cells.shape}")
 
 
 def _check_shapes(where: str, arrays: _Shaped) -> None:

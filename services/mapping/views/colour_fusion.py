@@ -36,6 +36,8 @@ def fuse_colours(
     """
     if half_steps <= 0 or len(look.visible.index) == 0:
         return
+    if look.moving is not None:
+        is_covered = is_covered & ~look.moving
     moves = _moves(look, torch.from_numpy(is_covered), appearance)
     steps = anchors.rows["steps"][look.visible.index]
     shares = half_steps / (half_steps + steps.float())

@@ -30,6 +30,7 @@ class FirstLook:
     visible: Visible
     colours: Tensor  # [V * k, 3], of the children: a leaf of the render's gradient
     rendered: Rendered
+    moving: NDArray[np.bool_] | None  # [H, W], pixels that do not count
 
     def depth_drawn_m(self) -> NDArray[np.float32]:
         """The map's depth, [H, W]; meaningless where alpha is low."""
@@ -51,7 +52,8 @@ def first_look(
         rendered = painter.rasterizer(gaussians, view)
     rgb = cv2.resize(image.rgb, (half.width, half.height), interpolation=cv2.INTER_AREA)
     depth_m = resized(image.depth_m, half.height, half.width)
-    return FirstLook(rgb.astype(np.float32) / 255.0, depth_m, visible, colours, rendered)
+    moving = None if image.moving is None else resized(image.moving, half.height, half.width)
+    return FirstLook(rgb.astype(np.float32) / 255.0, depth_m, visible, colours, rendered, moving)
 
 
 def resized(image: NDArray, height: int, width: int) -> NDArray:

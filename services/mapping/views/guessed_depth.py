@@ -42,6 +42,8 @@ def with_guesses(
     if not config.fill_holes:
         return image
     filled_m, camera = filled_depth(image.depth_m), image.intrinsics
+    if image.moving is not None:  # what is behind is not guessed
+        filled_m = np.where(image.moving, np.float32(0.0), filled_m)
     grid = slice(_STEP_PX // 2, None, _STEP_PX)
     rows, columns = np.nonzero((image.depth_m[grid, grid] == 0) & (filled_m[grid, grid] > 0))
     if len(rows) == 0:

@@ -24,7 +24,7 @@ from services.mapping.views.overlap import share_inside
 from services.mapping.views.training_views import TrainingView
 from shared import se3
 from shared.camera import Calibration, Intrinsics
-from shared.rectify import RgbdImage, rectify
+from shared.rectify import RgbdImage
 
 ANGLE_DEG = 20.0  # between the rays; as a standard deviation
 DEPTH_TOLERANCE_M = 0.007  # between the point and the measured surface; as a standard deviation
@@ -35,6 +35,7 @@ MAX_FACING = 64  # that are asked what they look through
 _COARSE_PX = 160  # width at which this is computed
 _PROBE_STRIDE = 12  # of coarse pixels, when keyframes are chosen
 _MILLIMETRES = 1000.0
+_HIDDEN_MM = 1  # what is behind something that moves is as if behind a hand on the lens
 
 
 class DrawnView(Protocol):
@@ -85,7 +86,10 @@ class Sightings:
         self.camera = image.intrinsics
         self._step = _step_of(image.intrinsics)
         coarse = image.depth_m[_grid(self._step)] * _MILLIMETRES
-        self._depths_mm[seq] = np.clip(coarse, 0, 65535).astype(np.uint16)
+        depth_mm = np.clip(coarse, 0, 65535).astype(np.uint16)
+        if image.moving is not None:
+            depth_mm[image.moving[_grid(self._step)]] = _HIDDEN_MM
+        self._depths_mm[seq] = depth_mm
 
     def confidence(
         self, drawn: DrawnView, view: View, keyframes: list[TrainingView]
@@ -156,7 +160,7 @@ class Sightings:
     def _depth_mm(self, keyframe: TrainingView) -> NDArray[np.uint16]:
         """A keyframe's depth; decoded anew after the session was taken up again."""
         if keyframe.seq not in self._depths_mm:
-            self.add(keyframe.seq, rectify(keyframe.frame, self._calibration))
+            self.add(keyframe.seq, keyframe.image(self._calibration))
         return self._depths_mm[keyframe.seq]
 
 

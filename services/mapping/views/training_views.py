@@ -15,10 +15,12 @@ from services.mapping.losses.mapping_loss import Target
 from services.mapping.views.overlap import overlapping
 from shared.camera import Calibration
 from shared.frames import Frame
+from shared.pixel_cells import pixels_of
 from shared.rectify import RgbdImage, rectify
 
 V = TypeVar("V")
 MakeTarget = Callable[[RgbdImage], Target]
+MovingCells = Mapping[int, NDArray[np.bool_]]  # of the keyframes in which something moves
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,18 @@ class TrainingView:
     t_ns: int
     frame: Frame
     T_world_camera: NDArray[np.float64]  # [4, 4]
+    moving_cells: NDArray[np.bool_] | None = None  # of `KeyframeData`: not looked at
+
+    def image(self, calibration: Calibration) -> RgbdImage:
+        """The decoded and rectified image, without what moves.
+
+        Raises:
+            InputError: its images cannot be decoded.
+        """
+        image = rectify(self.frame, calibration)
+        if self.moving_cells is None:
+            return image
+        return image.without(pixels_of(self.moving_cells, *image.depth_m.shape))
 
 
 class RecentlyUsed(Generic[V]):
@@ -89,7 +103,7 @@ class TrainingViews:
         Raises:
             InputError: its images cannot be decoded; it is not added.
         """
-        image = self._images.get(view.seq, lambda: rectify(view.frame, self._calibration))
+        image = self._images.get(view.seq, lambda: view.image(self._calibration))
         self._views[view.seq] = view
         if self._config.draws == "overlapping":
             poses = [(seq, other.T_world_camera) for seq, other in self._views.items()]
@@ -121,8 +135,8 @@ class TrainingViews:
 
     def image(self, seq: int) -> RgbdImage:
         """The decoded and rectified image of a keyframe."""
-        frame = self._views[seq].frame
-        return self._images.get(seq, lambda: rectify(frame, self._calibration))
+        view = self._views[seq]
+        return self._images.get(seq, lambda: view.image(self._calibration))
 
     def target(self, seq: int) -> Target:
         """What a render of a keyframe is compared with."""
@@ -138,10 +152,10 @@ class TrainingViews:
             "generator": self._rng.bit_generator.state,
         }
 
-    def restore(self, state: dict, frames: Mapping[int, Frame]) -> None:
+    def restore(self, state: dict, frames: Mapping[int, Frame], moving: MovingCells) -> None:
         """Take up a `state()`, with the frames of the keyframes that it names."""
         self._views = {
-            seq: TrainingView(seq, frames[seq].t_ns, frames[seq], np.array(pose))
+            seq: TrainingView(seq, frames[seq].t_ns, frames[seq], np.array(pose), moving.get(seq))
             for seq, pose in zip(state["seqs"], state["poses"], strict=True)
         }
         self._order = list(state["order"])
