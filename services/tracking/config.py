@@ -217,9 +217,10 @@ class KeyframeRuleConfig:
     max_turn_deg: float = 15.0
     max_step_share: float = 0.12  # of the median depth
     max_added_blur_px: float = 1.6  # at 640x480, beside the keyframes around: 6 px of motion
-    # Below one of these a blurred keyframe is better than losing the camera.
+    # Beyond one of these a blurred keyframe is better than losing the camera.
     min_blurred_overlap: float = 0.4
     min_blurred_landmarks: int = 100
+    max_blurred_turn_deg: float = 25.0  # from the reference, after one more turn like the last
 
     def __post_init__(self) -> None:
         _require_positive(self, "max_interval", "max_cloud_points", "max_added_blur_px")

@@ -38,6 +38,12 @@ class Coverage:
     landmark_share: float  # share of its features with depth that are landmarks
     T_reference_camera: NDArray[np.float64]  # [4, 4]
     median_depth_m: float
+    step_deg: float  # turned since the last frame with a pose
+
+    @property
+    def turn_deg(self) -> float:
+        """Turned since the reference keyframe."""
+        return float(np.degrees(angle_rad(self.T_reference_camera)))
 
 
 @dataclass(frozen=True)
@@ -63,12 +69,13 @@ def sharpness_of(image: RgbdImage, window: tuple[WindowKeyframe, ...]) -> Sharpn
 def is_too_blurred(
     sharpness: Sharpness, coverage: Coverage, intrinsics: Intrinsics, config: KeyframeRuleConfig
 ) -> bool:
-    """Far less sharp than the keyframes around, while these still show enough to wait."""
+    """Far less sharp than the keyframes around, while these show enough for one more such step."""
     scale = np.sqrt(intrinsics.width * intrinsics.height / BASE_PIXELS)
     is_blurred = sharpness.added_blur_px > config.max_added_blur_px * scale
     can_wait = (
         coverage.overlap >= config.min_blurred_overlap
         and coverage.landmarks >= config.min_blurred_landmarks
+        and coverage.turn_deg + coverage.step_deg <= config.max_blurred_turn_deg
     )
     return bool(is_blurred and can_wait)
 
@@ -81,8 +88,7 @@ def becomes_keyframe(
     Never a repeated view, and never one without enough depth to bring anything.
     """
     step_m = float(np.linalg.norm(coverage.T_reference_camera[:3, 3]))
-    turn_deg = float(np.degrees(angle_rad(coverage.T_reference_camera)))
-    moved = step_m > config.min_step_m or turn_deg > config.min_turn_deg
+    moved = step_m > config.min_step_m or coverage.turn_deg > config.min_turn_deg
     is_repeat = prior.frame_digest == frame.digest()
     if is_repeat or not (frame.may_be_keyframe and moved):
         return False
@@ -92,7 +98,7 @@ def becomes_keyframe(
         coverage.overlap < config.min_overlap
         or coverage.landmark_share < config.min_landmark_share
         or prior.frames_since_keyframe + 1 >= config.max_interval
-        or turn_deg > config.max_turn_deg
+        or coverage.turn_deg > config.max_turn_deg
         or step_m > config.max_step_share * coverage.median_depth_m
     )
 

@@ -36,8 +36,9 @@ from services.tracking.prediction import brought_up
 from services.tracking.search import Found, Job, search
 from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
+from services.tracking.verification import step_between
 from services.tracking.window import NewKeyframe, adjust_window, first_correction
-from shared.frames import TrackingStatus, TrackRequest
+from shared.frames import Prior, TrackingStatus, TrackRequest
 from shared.pixel_cells import cells_of
 from shared.se3 import inverse
 from shared.tracks import (
@@ -162,7 +163,7 @@ def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | No
     frame, prior = job.request.frame, job.request.prior
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
-    coverage = _coverage(observed, estimate)
+    coverage = _coverage(observed, estimate, prior)
     if not is_well_known(pose_covariance(estimate.information, config), config.keyframe):
         return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
@@ -207,7 +208,7 @@ def _loop(job: Job, estimate: Estimate, observations: Observations) -> LoopConst
         return find_loop(job, estimate, observations)
 
 
-def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
+def _coverage(observed: Observed, estimate: Estimate, prior: Prior) -> Coverage:
     with_depth = int((observed.features.depths_m > 0.0).sum())
     T_world_reference = estimate.local.context.T_world_reference
     return Coverage(
@@ -217,6 +218,7 @@ def _coverage(observed: Observed, estimate: Estimate) -> Coverage:
         landmark_share=estimate.inliers / max(1, with_depth),
         T_reference_camera=inverse(T_world_reference) @ estimate.T_world_camera,
         median_depth_m=_median_depth(observed),
+        step_deg=step_between(prior.T_world_camera, estimate.T_world_camera).degrees,
     )
 
 

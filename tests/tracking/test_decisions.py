@@ -31,7 +31,7 @@ from shared.se3 import Pose, angle_rad, exp, inverse, log
 from shared.tracks import PointCloud
 
 STEP = exp([0.02, 0.0, 0.01, 0.0, 0.02, 0.0])
-WELL_COVERED = Coverage(9000, 0.95, 300, 0.8, exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0)
+WELL_COVERED = Coverage(9000, 0.95, 300, 0.8, exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0, 1.0)
 
 
 def prior(**changes) -> Prior:

@@ -14,6 +14,7 @@ from services.tracking.sharpness import edge_blur_px, gradients
 from shared.camera import Intrinsics
 from shared.images import decode_colour
 from shared.rectify import RgbdImage
+from shared.se3 import exp
 
 VGA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 BESIDE = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
@@ -70,8 +71,11 @@ def test_an_image_without_edges_has_no_blur_to_speak_of():
     assert edge_blur_px(np.full((480, 640, 3), 90, np.uint8)) == 0.0
 
 
-def covered(overlap: float, landmarks: int = 300) -> Coverage:
-    return Coverage(9000, overlap, landmarks, 0.5, np.eye(4), 2.0)
+def covered(
+    overlap: float, landmarks: int = 300, turn_deg: float = 0.0, step_deg: float = 0.0
+) -> Coverage:
+    T_reference_camera = exp([0.0, 0.0, 0.0, 0.0, np.radians(turn_deg), 0.0])
+    return Coverage(9000, overlap, landmarks, 0.5, T_reference_camera, 2.0, step_deg)
 
 
 @pytest.mark.parametrize(("edge_blur", "refused"), [(1.2, False), (1.8, False), (2.4, True)])
@@ -97,6 +101,17 @@ def test_where_hardly_any_landmark_is_left_a_blurred_keyframe_is_better_than_non
     sharpness = Sharpness(4.0, usual_blur_px=1.1)
 
     assert not is_too_blurred(sharpness, covered(0.7, landmarks=60), VGA, KeyframeRuleConfig())
+
+
+@pytest.mark.parametrize(("step_deg", "refused"), [(1.0, True), (13.0, False)])
+def test_a_blurred_keyframe_is_better_than_none_where_the_next_turn_leaves_the_map(
+    step_deg, refused
+):
+    coverage = covered(0.7, turn_deg=18.0, step_deg=step_deg)
+
+    is_refused = is_too_blurred(Sharpness(4.0, 1.1), coverage, VGA, KeyframeRuleConfig())
+
+    assert is_refused == refused
 
 
 def test_without_keyframes_of_known_blur_a_frame_is_its_own_measure():
