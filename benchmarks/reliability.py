@@ -1,6 +1,7 @@
 """Tracking on a bad day, in process: is it ever wrong without saying so?
 
-python -m benchmarks.reliability SEQUENCE... [--elsewhere SEQUENCE] [--frames N] [--json FILE]
+python -m benchmarks.reliability SEQUENCE... [--elsewhere SEQUENCE] [--carried SHARE] [--frames N]
+    [--json FILE]
 
 Every seventh frame comes twice, every fiftieth is missing, every tenth has no depth and the others
 lack a tenth of it, and for two seconds the camera is in another place. A pose is wrong where it is
@@ -19,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.disturbances import Plan, Sent, Sequence, disturbed
+from benchmarks.disturbances import CarriedPlane, Plan, Sent, Sequence, disturbed
 from benchmarks.tracking_run import Folder, StoreSource
 from services.gateway.prior import next_prior
 from services.mapping.keyframes.store import KeyframeStore
@@ -148,6 +149,12 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("sequences", nargs="+", type=Path)
     parser.add_argument("--elsewhere", type=Path, help="the other place; else a sibling folder")
+    parser.add_argument(
+        "--carried",
+        type=float,
+        default=0.0,
+        help="share of the image behind a board that goes along",
+    )
     parser.add_argument("--frames", type=int, default=Plan.frames)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -171,7 +178,10 @@ def main(argv: list[str]) -> int:
     rows = []
     for path in arguments.sequences:
         elsewhere = Folder(arguments.elsewhere or _sibling(path))
-        answers = run(Folder(path), elsewhere, plan, config)
+        folder: Sequence = Folder(path)
+        if arguments.carried > 0.0:
+            folder = CarriedPlane(folder, arguments.carried)
+        answers = run(folder, elsewhere, plan, config)
         rows.append(row_of(path.name, answers, plan))
         print(rows[-1], flush=True)
         if arguments.verbose:
