@@ -136,6 +136,13 @@ def test_the_newest_keyframe_gets_its_share_of_draws(mapper, insert):
     assert np.mean(np.array(draws) == 12) == pytest.approx(expected, abs=0.04)
 
 
+def test_a_new_keyframe_is_drawn_before_any_other(mapper, insert):
+    for seq in (0, 4, 8, 12):
+        insert(mapper, seq)
+
+        assert mapper.views.draw().seq == seq
+
+
 def test_with_overlapping_draws_only_keyframes_of_the_same_place_are_drawn(
     calibration, insert, true_pose
 ):

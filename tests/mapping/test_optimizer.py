@@ -8,7 +8,14 @@ import pytest
 import torch
 
 from services.mapping.anchors.rows import RowTable
-from services.mapping.decoding.optimizer import Youth, adam_rows, adam_rows_torch, begin_step
+from services.mapping.decoding.optimizer import (
+    BETA_MEAN,
+    BETA_SQUARE,
+    Youth,
+    adam_rows,
+    adam_rows_torch,
+    begin_step,
+)
 
 COLUMN = ((3,), torch.float32)
 
@@ -31,7 +38,7 @@ def gradients(steps: int, rows: int) -> torch.Tensor:
 def test_steps_of_all_rows_equal_torchs_adam(function):
     rows, index = table(), torch.arange(6)
     parameter = rows["x"].clone().requires_grad_()
-    adam = torch.optim.Adam([parameter], lr=0.01, eps=1e-12)
+    adam = torch.optim.Adam([parameter], 0.01, (BETA_MEAN, BETA_SQUARE), eps=1e-12)
 
     for gradient in gradients(20, 6):
         function(begin_step(rows, index), "x", gradient, 0.01)

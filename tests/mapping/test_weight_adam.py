@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from services.mapping.decoding.optimizer import BETA_MEAN, BETA_SQUARE
 from services.mapping.decoding.weight_adam import WeightAdam
 
 RATES = {"weight": 0.01, "bias": 0.002}
@@ -31,7 +32,8 @@ def slope(named: dict[str, Tensor], step: int) -> None:
 def test_it_steps_as_torchs_adam():
     ours, theirs = weights(), weights()
     groups = [{"params": [theirs[name]], "lr": RATES[name]} for name in theirs]
-    adam, twin = WeightAdam(ours), torch.optim.Adam(groups, eps=1e-15)
+    betas = BETA_MEAN, BETA_SQUARE
+    adam, twin = WeightAdam(ours), torch.optim.Adam(groups, betas=betas, eps=1e-15)
 
     for step in range(50):
         slope(ours, step)

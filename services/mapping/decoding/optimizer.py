@@ -14,7 +14,7 @@ from services.mapping.anchors.rows import RowTable
 from services.mapping.rasterizer.memory import fetch_add
 from services.mapping.rasterizer.threads import default_threads, workers
 
-BETA_MEAN = 0.9
+BETA_MEAN = 0.7  # each step shows another view: with 0.9, steps go on where the last views pulled
 BETA_SQUARE = 0.999
 EPSILON = 1e-12
 STEEPEST = 1e15  # a slope beyond is a fault: its square would end every later step of its row

@@ -74,6 +74,7 @@ class TrainingViews:
         self._views: dict[int, TrainingView] = {}
         self._overlapping: list[int] = []  # seqs that overlap the newest one's view
         self._order: list[int] = []  # seqs left in this round of a refinement
+        self._is_newest_drawn = True
         self._rng = np.random.default_rng([seed, 1])
         pixels = calibration.colour.intrinsics.width * calibration.colour.intrinsics.height
         images = max(1, config.cached_images_mb * 1_000_000 // (pixels * 7))
@@ -105,6 +106,7 @@ class TrainingViews:
         """
         image = self._images.get(view.seq, lambda: view.image(self._calibration))
         self._views[view.seq] = view
+        self._is_newest_drawn = False
         if self._config.draws == "overlapping":
             poses = [(seq, other.T_world_camera) for seq, other in self._views.items()]
             pose, share = view.T_world_camera, self._config.min_overlap
@@ -116,12 +118,15 @@ class TrainingViews:
         self._views[seq] = replace(self._views[seq], T_world_camera=T_world_camera)
 
     def draw(self) -> TrainingView:
-        """The newest keyframe in a share of draws, else any one (GS-ICP SLAM, Tab. 8).
+        """The newest keyframe once, then in a share of draws, else any one.
 
-        By the setting `draws`, only those that overlap the newest one, as the paper's are.
+        What a keyframe brings is learned at once; more steps on it in a row only fit the map to
+        one view. By the setting `draws`, the others are only those that overlap the newest one,
+        as the paper's are.
         """
         seqs = self.seqs()
-        if self._rng.random() < self._config.newest_share:
+        if not self._is_newest_drawn or self._rng.random() < self._config.newest_share:
+            self._is_newest_drawn = True
             return self._views[seqs[-1]]
         if self._config.draws == "overlapping":
             seqs = self._overlapping or seqs[-1:]
@@ -149,6 +154,7 @@ class TrainingViews:
             "poses": [view.T_world_camera.tolist() for view in self._views.values()],
             "order": list(self._order),
             "overlapping": list(self._overlapping),
+            "is_newest_drawn": self._is_newest_drawn,
             "generator": self._rng.bit_generator.state,
         }
 
@@ -160,4 +166,5 @@ class TrainingViews:
         }
         self._order = list(state["order"])
         self._overlapping = list(state["overlapping"])
+        self._is_newest_drawn = state.get("is_newest_drawn", True)  # not in older snapshots
         self._rng.bit_generator.state = state["generator"]
