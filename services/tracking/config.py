@@ -78,6 +78,8 @@ class OrbConfig:
     max_hamming_bits_global: int = 64  # matching without a pose
     ratio_global: float = 0.8
     max_depth_spread: float = 0.03  # relative, around a keypoint whose depth is trusted
+    noise_spreads: float = 1.5  # of a noisy sensor: times the spread that a quarter stay below
+    max_noisy_depth_spread: float = 0.15  # beyond it the patch is torn, noisy or not
     max_feature_depth_m: float = 8.0
 
     def __post_init__(self) -> None:

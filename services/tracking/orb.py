@@ -101,11 +101,23 @@ def detect(
 
 
 def with_depth(keypoints: Keypoints, depth_m: NDArray[np.float32], config: OrbConfig) -> Features:
-    """Look up each keypoint in the registered depth image."""
-    depths = _trusted_depths(
-        depth_m, keypoints.keypoints_px, config.max_depth_spread, config.max_feature_depth_m
-    )
+    """Look up each keypoint in the registered depth image.
+
+    Where even the calmest patches are noisy, readings need not agree better than these do.
+    """
+    depths, spreads = _patches(depth_m, keypoints.keypoints_px, config.max_feature_depth_m)
+    is_trusted = spreads <= _max_spread(spreads, config)
+    depths = np.where(is_trusted, depths, np.float32(0.0))
     return Features(keypoints.keypoints_px, keypoints.octaves, keypoints.descriptors, depths)
+
+
+def _max_spread(spreads: NDArray[np.float64], config: OrbConfig) -> float:
+    """How far the readings of a patch may lie apart in an image of this noise, relative."""
+    measured = spreads[np.isfinite(spreads)]
+    if len(measured) == 0:
+        return config.max_depth_spread
+    usual = config.noise_spreads * float(np.quantile(measured, 0.25))
+    return min(max(usual, config.max_depth_spread), config.max_noisy_depth_spread)
 
 
 def no_features() -> Features:
@@ -145,10 +157,13 @@ def _ranks_in_cells(pixels, cell_px):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True)
-def _trusted_depths(depth, pixels, max_spread, max_depth):  # pragma: no cover - compiled
-    """Depth at each keypoint where its 3x3 patch has enough readings that agree, else 0."""
+def _patches(depth, pixels, max_depth):  # pragma: no cover - compiled
+    """Mean depth of each keypoint's 3x3 patch, and how far its readings lie apart, relative.
+
+    Infinitely far where there are too few, or one of them is too far away.
+    """
     height, width = depth.shape
-    out = np.zeros(len(pixels), np.float32)
+    depths, spreads = np.zeros(len(pixels), np.float32), np.full(len(pixels), np.inf)
     for n in range(len(pixels)):
         u = int(np.floor(pixels[n, 0] + 0.5))
         v = int(np.floor(pixels[n, 1] + 0.5))
@@ -158,6 +173,6 @@ def _trusted_depths(depth, pixels, max_spread, max_depth):  # pragma: no cover -
                 z = depth[vv, uu]
                 if z > 0.0:
                     low, high, total, count = min(low, z), max(high, z), total + z, count + 1
-        if count >= 6 and high <= max_depth and high - low <= max_spread * low:
-            out[n] = total / count
-    return out
+        if count >= 6 and high <= max_depth:
+            depths[n], spreads[n] = total / count, (high - low) / low
+    return depths, spreads

@@ -67,6 +67,20 @@ def test_depth_at_an_edge_is_not_trusted(room):
     assert (features.depths_m == 0.0).all()
 
 
+def test_most_features_keep_their_depth_under_a_noisy_sensor(room):
+    image = room.view(np.eye(4))
+    noise = np.random.default_rng(0).standard_normal(image.depth_m.shape)
+    noisy = (image.depth_m * (1.0 + 0.03 * noise)).astype(np.float32)
+
+    features = extract_features(RgbdImage(image.rgb, noisy, image.intrinsics), CONFIG)
+
+    exact = extract_features(image, CONFIG)
+    both = (features.depths_m > 0.0) & (exact.depths_m > 0.0)
+    errors = features.depths_m[both] / exact.depths_m[both] - 1.0
+    assert both.sum() > 0.5 * (exact.depths_m > 0.0).sum()
+    assert np.sqrt(np.mean(errors**2)) < 0.015
+
+
 def test_population_count_equals_that_of_python():
     words = np.random.default_rng(0).integers(0, 2**63, 100, np.uint64)
 
