@@ -69,6 +69,8 @@ class OrbConfig:
     num_detected: int = 2500  # before they are spread over cells
     cell_px: int = 40
     fast_threshold: int = 8
+    faint_threshold: int = 3  # where few are found at the usual one: a dark or plain image
+    few_features: int = 300
     num_levels: int = 8
     search_radius_px: float = 10.0
     few_matches: int = 40  # fewer are looked for once more, in a wider circle

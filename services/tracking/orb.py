@@ -77,17 +77,14 @@ def detect(
     """Detect where the mask [H, W] allows it, spread over cells, describe.
 
     OpenCV keeps the strongest corners wherever they crowd; the pose wants them all over the image,
-    so more are detected and each cell gives its best ones in turn.
+    so more are detected and each cell gives its best ones in turn. ORB-SLAM, too, looks again at a
+    lower threshold where hardly anything is found.
     """
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    orb = cv2.ORB.create(
-        nfeatures=config.num_detected,
-        nlevels=config.num_levels,
-        fastThreshold=config.fast_threshold,
-    )
-    keypoints, descriptors = orb.detectAndCompute(
-        grey, None if where is None else where.astype(np.uint8)
-    )
+    mask = None if where is None else where.astype(np.uint8)
+    keypoints, descriptors = _orb(config.fast_threshold, config).detectAndCompute(grey, mask)
+    if len(keypoints) < config.few_features:
+        keypoints, descriptors = _orb(config.faint_threshold, config).detectAndCompute(grey, mask)
     if not keypoints:
         return _no_keypoints()
     pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
@@ -97,6 +94,12 @@ def detect(
     assert descriptors is not None
     return Keypoints(
         pixels[chosen], octaves[chosen], np.ascontiguousarray(descriptors[chosen], np.uint8)
+    )
+
+
+def _orb(fast_threshold: int, config: OrbConfig) -> cv2.ORB:
+    return cv2.ORB.create(
+        nfeatures=config.num_detected, nlevels=config.num_levels, fastThreshold=fast_threshold
     )
 
 

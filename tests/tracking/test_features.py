@@ -58,6 +58,13 @@ def test_an_image_without_texture_has_no_features(room):
     assert len(extract_features(grey, CONFIG).octaves) == 0
 
 
+def test_a_tenth_of_the_light_leaves_enough_features(room):
+    image = room.view(np.eye(4))
+    dark = RgbdImage(image.rgb // 10, image.depth_m, image.intrinsics)
+
+    assert len(extract_features(dark, CONFIG).octaves) >= CONFIG.few_features
+
+
 def test_depth_at_an_edge_is_not_trusted(room):
     image = room.view(np.eye(4))
     torn = image.depth_m * (1.0 + 0.2 * (np.indices(image.depth_m.shape).sum(axis=0) % 2))
