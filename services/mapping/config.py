@@ -97,8 +97,10 @@ class LearningRates:
 class RefinementConfig:
     """Steps of Adam in a refinement: wide at first, as there is time to settle."""
 
-    rates: LearningRates = LearningRates(features=0.04, scalings=0.02, opacity_network=8e-3)
-    decay: float = 0.1  # of all rates, at the end
+    rates: LearningRates = LearningRates(
+        features=0.04, offsets=0.05, scalings=0.05, opacity_network=8e-3
+    )
+    decay: float = 0.2  # of all rates, at the end
 
     def __post_init__(self) -> None:
         _check(0 < self.decay <= 1, f"refinement.decay must be 0 to 1, got {self.decay}")
