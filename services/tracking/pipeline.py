@@ -127,14 +127,11 @@ def _begin(job: Job) -> TrackResult:
 
 
 def _lost(job: Job, local: LocalMap) -> TrackResult:
-    """The prior's pose again, said to be lost."""
-    prior = job.request.prior
-    if prior is None:
-        context = local.context
-        return _without_pose(
-            job, TrackingStatus.LOST, context.T_world_reference, context.reference_seq
-        )
-    return _without_pose(job, TrackingStatus.LOST, prior.T_world_camera, prior.reference_seq)
+    """The prior's pose again, said to be lost; as any other it goes along with its keyframe."""
+    prior, context = job.request.prior, local.context
+    T = context.T_world_reference if prior is None else prior.T_world_camera
+    lost = _without_pose(job, TrackingStatus.LOST, T, context.reference_seq)
+    return replace(lost, T_reference_camera=inverse(context.T_world_reference) @ T)
 
 
 def _without_pose(

@@ -75,6 +75,15 @@ def test_a_blind_frame_is_lost_and_repeats_the_pose_before_it(room, session):
     assert result.keyframe is None
 
 
+def test_a_lost_frame_stays_where_it_was_told_beside_its_keyframe(room, session):
+    before = walk(room, session, 3)
+
+    result = session.track(blind(room.frame(3, path(3))))
+    T_world_camera = session.store.pose(result.reference_seq) @ result.T_reference_camera
+
+    np.testing.assert_allclose(T_world_camera, before.T_world_camera, atol=1e-12)
+
+
 def test_tracking_goes_on_after_blind_frames(room, session):
     walk(room, session, 3)
     for i in range(3, 6):
