@@ -407,6 +407,13 @@ def test_a_local_gateway_answers_to_names_of_this_machine_alone(gateway):
     assert (response.status_code, response.json()["code"]) == (403, "forbidden")
 
 
+@pytest.mark.parametrize("name", ["Host", "Origin"])
+def test_a_header_that_is_no_address_is_refused(gateway, name):
+    response = httpx.get(gateway.url + "/v1/sessions", headers={name: "http://[::1"})
+
+    assert (response.status_code, response.json()["code"]) == (403, "forbidden")
+
+
 def test_a_local_gateway_gives_tickets_too(gateway):
     assert set(httpx.post(gateway.url + "/v1/tickets").json()) == {"ticket", "expires_in_s"}
 

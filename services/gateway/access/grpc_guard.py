@@ -110,7 +110,7 @@ class _Guarded:
         serving = asyncio.current_task()
 
         async def watch() -> None:
-            while self._authority.is_valid(caller):
+            while not self._authority.has_ended(caller):
                 await asyncio.sleep(self._authority.config.recheck_s)
             with suppress(grpc.aio.AbortError):
                 await context.abort(
