@@ -28,6 +28,7 @@ _KEY = re.compile(r"ps_([0-9a-f]{12})_[A-Za-z0-9_-]{43}")
 _SCHEMA = """CREATE TABLE IF NOT EXISTS keys (
     id TEXT PRIMARY KEY, digest BLOB NOT NULL, tenant TEXT NOT NULL, scopes TEXT NOT NULL,
     label TEXT NOT NULL, created_s REAL NOT NULL, expires_s REAL, revoked_s REAL)"""
+_END_OF_DATES_S = 253_402_300_800.0  # no calendar of Python's goes further
 _COLUMNS = "id, tenant, scopes, label, created_s, expires_s, revoked_s"
 
 
@@ -54,8 +55,8 @@ class NewKey:
         check_tenant(self.tenant)
         if not self.scopes:
             raise InputError("scopes", f"must be some of {', '.join(Scope)}")
-        if self.expires_s is not None and self.expires_s <= time.time():
-            raise InputError("expires_s", "must lie in the future")
+        if self.expires_s is not None and not time.time() < self.expires_s < _END_OF_DATES_S:
+            raise InputError("expires_s", "must lie in the future, and before the year 10000")
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,17 @@ def test_a_key_is_found_with_its_tenant_and_scopes(store):
     assert record.id == key_id(text)
 
 
+@pytest.mark.parametrize("days", ["nan", "inf", "1e12", "0"])
+def test_a_life_that_no_calendar_holds_is_refused(file, days, capsys):
+    KeyStore.open(file).create(NewKey())
+
+    refused = main(["create", "--store", str(file), "--days", days])
+    listed = main(["list", "--store", str(file)])
+
+    assert (refused, listed) == (2, 0)
+    assert "expires_s: must lie in the future" in capsys.readouterr().err
+
+
 def test_a_key_has_256_random_bits_and_another_each_time(store):
     texts = {store.create(NewKey()) for _ in range(20)}
 
