@@ -15,6 +15,7 @@ from shared.errors import InputError
 
 MAX_IMAGE_SIDE_PX = 8192
 MAX_IMAGE_PX = 1 << 24  # of one image: a worker holds several arrays of this size
+_MAX_BASELINE_M = 2.0  # between the two cameras of a device
 
 
 @dataclass(frozen=True)
@@ -126,5 +127,11 @@ def _check_rigid(T: NDArray[np.float64]) -> None:
     name = "calibration.T_colour_depth"
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(name, f"must be 4x4 finite numbers, got shape {T.shape}")
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
         raise InputError(name, "its 3x3 block must be a rotation")
+    if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise InputError(name, f"must end with the row 0 0 0 1, got {T[3].tolist()}")
+    if np.abs(T[:3, 3]).max() > _MAX_BASELINE_M:
+        found = f"got {T[:3, 3].tolist()}: are they millimetres?"
+        raise InputError(name, f"must shift by at most {_MAX_BASELINE_M:g} m, {found}")
