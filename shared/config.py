@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -94,6 +95,9 @@ def _cast(value: Any, current: Any, name: str) -> Any:
 
 def _number(kind: type, value: Any, name: str) -> Any:
     try:
-        return kind(value)
-    except ValueError:
-        raise ConfigError(f"{name} must be {kind.__name__}, got {value!r}") from None
+        number = kind(value)
+        if not math.isfinite(number):  # passes every check that asks for too small or too large
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise ConfigError(f"{name} must be {kind.__name__}, got {str(value)[:40]!r}") from None
+    return number

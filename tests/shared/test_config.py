@@ -61,6 +61,12 @@ def test_a_switch_takes_only_true_and_false(value):
         override(Config(), {"step": {"is_on": value}})
 
 
+@pytest.mark.parametrize("word", ["voxel_size_m=.nan", "voxel_size_m=.inf", "voxel_size_m=1e999"])
+def test_a_number_that_is_none_is_refused(word):
+    with pytest.raises(ConfigError, match=r"step\.voxel_size_m must be float"):
+        override(Config(), read_overrides(None, [f"step.{word}"]))
+
+
 def test_a_group_is_not_a_value():
     with pytest.raises(ConfigError, match="step is a group"):
         override(Config(), {"step": 3})
