@@ -25,6 +25,7 @@ import numpy as np
 
 from benchmarks.disturbances import to_and_fro
 from benchmarks.tracking import Folder
+from pointslam.process import DEFAULT_ENVIRONMENT
 from services.gateway.prior import next_prior
 from services.mapping.keyframes.contexts import Contexts
 from services.mapping.keyframes.store import KeyframeStore
@@ -75,10 +76,12 @@ class Process:
 
 @contextmanager
 def worker(endpoint: str) -> Iterator[Process]:
-    """A worker process that is ready."""
+    """A worker process that is ready, started as `pointslam` starts its own."""
     command = [sys.executable, "-m", "services.tracking", "--connect", endpoint, "--id", _SESSION]
     command += ["--set", f"query_timeout_s={_PATIENCE_S}"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    environment = DEFAULT_ENVIRONMENT | os.environ
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, text=True, env=environment) as process:
         assert process.stdout is not None
         try:
             process.stdout.readline()

@@ -13,7 +13,7 @@ from pathlib import Path
 from shared.errors import UnavailableError
 
 _TAIL_LINES = 15
-_DEFAULTS = {
+DEFAULT_ENVIRONMENT = {  # what is set already stays
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -49,7 +49,7 @@ class ServiceProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=_DEFAULTS | os.environ | {"PYTHONUNBUFFERED": "1"},
+                env=DEFAULT_ENVIRONMENT | os.environ | {"PYTHONUNBUFFERED": "1"},
                 process_group=0,  # Ctrl-C is ours to handle, in order; priorities hold in a session
             )
 
