@@ -33,5 +33,8 @@ class Janitor:
             for task in self._tasks:
                 try:
                     task()
-                except PointSlamError as error:  # a disk that refuses may be well next time
+                except (
+                    PointSlamError,
+                    OSError,
+                ) as error:  # a disk that refuses may be well next time
                     LOGGER.warning("not tidied up: %s", error)
