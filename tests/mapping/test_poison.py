@@ -19,7 +19,7 @@ from shared.errors import InputError
 from shared.frames import DepthEncoding
 from shared.images import encode_depth, encode_jpeg
 from shared.maps import RenderRequest
-from shared.tracks import KeyframePoses
+from shared.tracks import KeyframeLink, KeyframePoses, LoopConstraint
 
 SHAPE = 72, 96
 
@@ -132,6 +132,22 @@ def test_a_camera_beyond_the_horizon_is_refused(entry):
 
     with pytest.raises(InputError, match="10000 m"):
         check_entry(replace(good, record=replace(good.record, T_world_camera=far)))
+
+
+def test_a_link_without_six_by_six_numbers_is_refused(entry):
+    good = entry(4)
+    bad = replace(good.keyframe, link=KeyframeLink(0, 1, np.eye(3)))
+
+    with pytest.raises(InputError, match=r"keyframe\.link\.information"):
+        check_entry(replace(good, keyframe=bad))
+
+
+def test_a_loop_with_single_landmarks_is_refused(entry):
+    good = entry(4)
+    loop = LoopConstraint(0, np.eye(4), np.eye(6), np.arange(6))
+
+    with pytest.raises(InputError, match=r"keyframe\.loop\.landmark_ids"):
+        check_entry(replace(good, keyframe=replace(good.keyframe, loop=loop)))
 
 
 def test_landmarks_of_a_correction_must_be_finite(entry):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from shared.errors import InputError
 from shared.frames import Prior
-from shared.tracks import Advance, FrameRecord, KeyframeData
+from shared.tracks import Advance, FrameRecord, KeyframeData, KeyframeLink, LoopConstraint
 
 _FURTHEST_M = 10_000.0  # voxels of a map are numbered that far
 _Shaped = Mapping[str, tuple[NDArray, tuple[int, ...]]]
@@ -30,6 +30,7 @@ def check_entry(entry: Advance) -> None:
         _check_shapes("prior", _shapes_of_prior(entry.prior))
     if entry.keyframe is not None:
         _check_shapes("keyframe", _shapes_of_keyframe(entry.keyframe))
+        _check_shapes("keyframe", _shapes_of_ties(entry.keyframe.link, entry.keyframe.loop))
         cells = entry.keyframe.moving_cells
         if cells is not None and cells.ndim != 2:
             raise InputError("keyframe.moving_cells", f"must have two axes, got {cells.shape}")
@@ -91,3 +92,15 @@ def _shapes_of_keyframe(data: KeyframeData) -> _Shaped:
         "correction.landmark_ids": (moved.landmark_ids, (landmarks,)),
         "correction.positions_world": (moved.positions_world, (landmarks, 3)),
     }
+
+
+def _shapes_of_ties(link: KeyframeLink | None, loop: LoopConstraint | None) -> _Shaped:
+    """How a keyframe hangs on others: the pose graph is made of these."""
+    shapes: dict[str, tuple[NDArray, tuple[int, ...]]] = {}
+    if link is not None:
+        shapes["link.information"] = link.information, (6, 6)
+    if loop is not None:
+        shapes["loop.T_earlier_keyframe"] = loop.T_earlier_keyframe, (4, 4)
+        shapes["loop.information"] = loop.information, (6, 6)
+        shapes["loop.landmark_ids"] = loop.landmark_ids, (loop.landmark_ids.size // 2, 2)
+    return shapes
