@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import resource
 import signal
 
@@ -151,6 +153,23 @@ def test_a_damaged_snapshot_is_passed_over_for_the_one_before(tmp_path):
     damaged.write_bytes(damaged.read_bytes()[:-8] + b"damaged!")
 
     found = read_newest(tmp_path)
+    assert found is not None
+    assert found.entries == 1
+
+
+def test_a_snapshot_of_a_version_that_knew_more_is_passed_over(tmp_path):
+    for value in (1.0, 2.0):
+        write_snapshot(tmp_path, snapshot(value))
+    newest = tmp_path / "snapshot-000002"
+    values = json.loads((newest / "values.json").read_text())
+    values["refinement"]["of_tomorrow"] = 1
+    (newest / "values.json").write_text(json.dumps(values))
+    checksums = json.loads((newest / "manifest.json").read_text())
+    digest = hashlib.sha256((newest / "values.json").read_bytes()).hexdigest()
+    (newest / "manifest.json").write_text(json.dumps(checksums | {"values.json": digest}))
+
+    found = read_newest(tmp_path)
+
     assert found is not None
     assert found.entries == 1
 

@@ -23,7 +23,7 @@ import safetensors.torch
 from services.mapping.map_state import MapState
 from services.mapping.storage.folders import storage_errors, sync_folder
 from shared import codec
-from shared.errors import StorageError
+from shared.errors import InputError, StorageError
 from shared.maps import JobStatus
 
 LOGGER = logging.getLogger(__name__)
@@ -34,6 +34,8 @@ _MAP, _KEYFRAMES, _VALUES, _MANIFEST = (
     "values.json",
     "manifest.json",
 )
+# Damaged, or written by a version that knew more: an older one, or the log, is read instead.
+_UNREADABLE = (OSError, ValueError, KeyError, safetensors.SafetensorError, InputError)
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def read_newest(session: Path) -> Snapshot | None:
     for folder in reversed(snapshot_folders(session)):
         try:
             return _read(folder)
-        except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
+        except _UNREADABLE as error:
             LOGGER.warning("%s: passed over (%s: %s)", folder, type(error).__name__, error)
     return None
 
