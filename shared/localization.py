@@ -42,7 +42,7 @@ class LocalizeResult:
     status: LocalizationStatus
     reason: str  # why it was not found, for people; else empty
     T_world_camera: NDArray[np.float64]  # [4, 4]
-    covariance: NDArray[np.float64]  # [6, 6], of a left twist (rho, phi) in the camera frame
+    covariance: NDArray[np.float64]  # [6, 6], of a twist (rho, phi) on the right of it
     inliers: int
     inlier_share: float
     reference_seq: int  # the keyframe that it was found by; -1 where there is none
@@ -70,7 +70,7 @@ class LocalizeReply:
     """The answer as clients get it: a pose and how good it is, or the reason why there is none.
 
     `pos_std_m` and `rot_std_deg` are one standard deviation; `covariance` has the 6x6 numbers of a
-    left twist (rho, phi: metres, radians) in the camera frame, row by row.
+    twist (rho, phi: metres, radians) on the right of the pose, in the camera frame, row by row.
     """
 
     status: LocalizationStatus

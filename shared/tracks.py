@@ -136,7 +136,7 @@ class TrackResult:
     t_ns: int
     status: TrackingStatus
     T_world_camera: NDArray[np.float64]  # [4, 4]
-    covariance: NDArray[np.float64]  # [6, 6], of a left twist (rho, phi) in the camera frame
+    covariance: NDArray[np.float64]  # [6, 6], of a twist (rho, phi) on the right of it
     reference_seq: int
     T_reference_camera: NDArray[np.float64]  # [4, 4]
     inliers: int
