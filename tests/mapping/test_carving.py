@@ -57,6 +57,13 @@ def test_what_lies_outside_the_image_is_not_judged(wall):
     assert not seen_through(on_axis(1.0), wall, T_world_camera, CONFIG).any()
 
 
+def test_a_corner_without_readings_says_nothing(wall):
+    wall.depth_m[:8, :8] = 0.0
+    corner = np.array([[-31.5 / 50.0, -23.5 / 50.0, 1.0]], np.float32)
+
+    assert not seen_through(corner, wall, np.eye(4), CONFIG).any()
+
+
 def test_a_hole_in_the_depth_says_nothing(wall):
     wall.depth_m[:] = 0.0
 

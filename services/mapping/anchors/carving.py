@@ -17,6 +17,9 @@ from services.mapping.config import AnchorConfig
 from shared import se3
 from shared.rectify import RgbdImage
 
+# Less than what lies beyond the border for `erode`, the largest float.
+_NO_READING_M = np.float32(1e30)
+
 
 def carve(
     anchors: AnchorMap,
@@ -54,7 +57,7 @@ def seen_through(
     columns = np.round(x / z * camera.fx + camera.cx)
     rows = np.round(y / z * camera.fy + camera.cy)
     is_inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    nearest = _nearest_around(image.depth_m, config.carve_window_px)
+    nearest = nearest_around(image.depth_m, config.carve_window_px)
     measured = nearest[rows[is_inside].astype(np.int64), columns[is_inside].astype(np.int64)]
     limit = z[is_inside] * (1.0 + config.min_depth_gap) + config.min_depth_gap_m
     is_through = np.zeros(len(positions), bool)
@@ -62,8 +65,8 @@ def seen_through(
     return is_through
 
 
-def _nearest_around(depth_m: NDArray[np.float32], window_px: int) -> NDArray[np.float32]:
+def nearest_around(depth_m: NDArray[np.float32], window_px: int) -> NDArray[np.float32]:
     """The least reading in a window around each pixel, [H, W]; 0 where there is none."""
-    known = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    known = np.where(depth_m > 0, depth_m, _NO_READING_M)
     nearest = cv2.erode(known, np.ones((window_px, window_px), np.uint8))
-    return np.where(np.isinf(nearest), np.float32(0.0), nearest)
+    return np.where(nearest < _NO_READING_M, nearest, np.float32(0.0))

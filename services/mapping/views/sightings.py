@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from services.mapping.anchors.carving import nearest_around
 from services.mapping.rasterizer import View
 from services.mapping.views.overlap import share_inside
 from services.mapping.views.training_views import TrainingView
@@ -85,8 +86,8 @@ class Sightings:
         """Keep what a keyframe measured."""
         self.camera = image.intrinsics
         self._step = _step_of(image.intrinsics)
-        coarse = image.depth_m[_grid(self._step)] * _MILLIMETRES
-        depth_mm = np.clip(coarse, 0, 65535).astype(np.uint16)
+        coarse_m = _coarse_depth(image.depth_m, self._step)
+        depth_mm = np.clip(coarse_m * _MILLIMETRES, 0, 65535).astype(np.uint16)
         if image.moving is not None:
             depth_mm[image.moving[_grid(self._step)]] = _HIDDEN_MM
         self._depths_mm[seq] = depth_mm
@@ -171,6 +172,18 @@ def _step_of(intrinsics: Intrinsics) -> int:
 def _grid(step: int) -> tuple[slice, slice]:
     """The pixels that stand for all."""
     return slice(step // 2, None, step), slice(step // 2, None, step)
+
+
+def _coarse_depth(depth_m: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+    """The readings on the grid; where one is missing, the nearest surface of its cell.
+
+    Sensors that project a pattern leave single pixels out all over a surface.
+    """
+    sampled = depth_m[_grid(step)]
+    if sampled.all():
+        return sampled
+    nearest = nearest_around(depth_m, max(3, step | 1))[_grid(step)]
+    return np.where(sampled > 0, sampled, nearest)
 
 
 def _surface_points(depth_m: NDArray[np.float32], view: View, step: int) -> _Points:
