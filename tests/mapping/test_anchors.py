@@ -248,5 +248,14 @@ def test_holes_are_filled_from_around_and_measurements_stay():
     np.testing.assert_array_equal(filled[depth > 0], depth[depth > 0])
 
 
+def test_a_hole_in_a_slanted_wall_continues_the_wall():
+    v, u = np.mgrid[:120, :160]
+    wall = (1.0 / (0.3 + 0.001 * u + 0.0007 * v)).astype(np.float32)
+    depth = wall.copy()
+    depth[30:80, 40:100] = 0.0
+
+    np.testing.assert_allclose(filled_depth(depth), wall, rtol=0.005)
+
+
 def test_an_image_without_depth_stays_empty():
     assert filled_depth(np.zeros((5, 4), np.float32)).max() == 0.0

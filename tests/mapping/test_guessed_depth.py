@@ -52,6 +52,25 @@ def test_a_guess_that_a_keyframe_looks_through_goes_behind_and_readings_stay(ima
     assert np.array_equal(filled.depth_m[image.depth_m > 0], image.depth_m[image.depth_m > 0])
 
 
+def test_single_pixels_that_a_sensor_leaves_out_do_not_hide_what_it_looks_through(image):
+    depth = np.full((CAMERA.height, CAMERA.width), 2900, np.uint16)
+    depth[::2, ::2] = 0
+    frame = Frame(
+        0,
+        0,
+        encode_jpeg(np.zeros((*depth.shape, 3), np.uint8)),
+        encode_depth(depth, DepthEncoding.RAW16),
+    )
+    sightings = Sightings(CALIBRATION)
+    sightings.add(0, rectify(frame, CALIBRATION))
+
+    filled = with_guesses(
+        image, np.eye(4), sightings, [TrainingView(0, 0, frame, np.eye(4))], AnchorConfig()
+    )
+
+    assert np.allclose(filled.depth_m[HOLE], 3.0)
+
+
 def test_nothing_is_guessed_where_keyframes_look_through_every_guess(image):
     filled = with_guesses(image, np.eye(4), *seeing(9.0), AnchorConfig())
 
