@@ -79,13 +79,13 @@ def test_a_perfect_render_has_no_loss(image, target):
     assert loss.squared_error.item() == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_colour_term_is_the_weighted_mean_error(image, target):
+def test_the_colour_term_is_the_mean_error_and_the_weighted_mean_square(image, target):
     rendered = perfect(image)
     darker = replace(rendered, colour=rendered.colour - 0.1)
 
-    loss = mapping_loss(darker, target, PLAIN, replace(CONFIG, ssim=0.0, depth=0.0))
+    loss = mapping_loss(darker, target, PLAIN, replace(CONFIG, ssim=0.0, square=3.0, depth=0.0))
 
-    assert loss.total.item() == pytest.approx(0.1, rel=1e-5)
+    assert loss.total.item() == pytest.approx(0.1 + 3.0 * 0.1**2, rel=1e-5)
 
 
 def test_depth_error_is_metres_where_both_depths_are_known(image, target):

@@ -1,4 +1,4 @@
-"""`losses.mapping_loss` for CPUs: composition, L1 and depth error in two fused passes.
+"""`losses.mapping_loss` for CPUs: composition, colour and depth error in two fused passes.
 
 Plain torch makes some thirty passes over images that leave the cache.
 """
@@ -34,7 +34,7 @@ def mapping_loss_cpu(
     image, colour, squared, depth = _Compare.apply(
         rendered.colour, rendered.depth, rendered.alpha, appearance.exposure, comparison
     )  # pyright: ignore[reportGeneralTypeIssues]
-    total = (1.0 - config.ssim) * colour + config.depth * depth
+    total = (1.0 - config.ssim) * (colour + config.square * squared) + config.depth * depth
     if config.ssim > 0:
         total = total + config.ssim * (1.0 - target.similarity(image))
     return Loss(total, squared.detach())
@@ -63,12 +63,12 @@ class _Compare(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        by_image, by_colour, _, by_depth = gradients
+        by_image, by_colour, by_square, by_depth = gradients
         count, room = ctx.images.pixels, _room(ctx.images.pixels)
-        weights = np.float32(by_colour / (3 * count)), np.float32(by_depth / count)
+        shares = by_colour / (3 * count), 2.0 * by_square / (3 * count), by_depth / count
         borrow = scratch().borrow
         down = borrow(room * 3), borrow(room), borrow(room), _sums(count)
-        slopes = _whole_vectors(by_image), *weights
+        slopes = _whole_vectors(by_image), *map(np.float32, shares)
         workers(default_threads()).run(compare_back, ctx.images, ctx.look, slopes, down)
         by_exposure = down[3].sum(0, dtype=np.float64)[:6].astype(np.float32).reshape(2, 3)
         shapes = (*ctx.shape, 3), ctx.shape, ctx.shape

@@ -1,4 +1,4 @@
-"""Kernels of `losses_cpu`: composition, L1 and depth error, a vector of pixels at a time."""
+"""Kernels of `losses_cpu`: composition, colour and depth error, a vector of pixels at a time."""
 
 from __future__ import annotations
 
@@ -74,9 +74,10 @@ def compare(images, look, image, sums, counter):
 def compare_back(images, look, slopes, down, counter):
     """Fill the gradients at colour, depth and alpha; sums [pieces, LANES] of gain's and bias's.
 
-    `slopes` is (gradient at the image, weight of a colour error, weight of a depth error).
+    `slopes` is (gradient at the image, weights of a colour error, of half its square, and of a
+    depth error).
     """
-    upstream, colour_weight, depth_weight = slopes
+    upstream, colour_weight, square_weight, depth_weight = slopes
     by_colour, by_depth, by_alpha, sums = down
     while True:
         piece = fetch_add(counter, 0, 1)
@@ -90,9 +91,9 @@ def compare_back(images, look, slopes, down, counter):
             _, errors, composites = _colours(images, look, i, is_inside)
             u = load_three(upstream, 3 * i)
             r, g, b = (
-                select(is_inside, u[0] + _sign(errors[0]) * colour_weight, zero),
-                select(is_inside, u[1] + _sign(errors[1]) * colour_weight, zero),
-                select(is_inside, u[2] + _sign(errors[2]) * colour_weight, zero),
+                select(is_inside, u[0] + _slope(errors[0], colour_weight, square_weight), zero),
+                select(is_inside, u[1] + _slope(errors[1], colour_weight, square_weight), zero),
+                select(is_inside, u[2] + _slope(errors[2], colour_weight, square_weight), zero),
             )
             biases = biases[0] + r, biases[1] + g, biases[2] + b
             gains = (
@@ -110,6 +111,11 @@ def compare_back(images, look, slopes, down, counter):
             store(by_alpha, i, behind * -_ONE - share * load(images.depth, i) / alpha)
         total = lane_sums((*gains, *biases, zero, zero))
         store(sums[piece], 0, total)
+
+
+@inlined
+def _slope(error, colour_weight, square_weight):
+    return _sign(error) * colour_weight + error * square_weight
 
 
 @inlined

@@ -83,11 +83,12 @@ class Loss:
 def mapping_loss(
     rendered: Rendered, target: Target, appearance: Appearance, config: LossConfig
 ) -> Loss:
-    """(1 - w) L1 + w (1 - SSIM) + depth L1, each a mean over the image's pixels."""
+    """(1 - w) (L1 + q L2) + w (1 - SSIM) + depth L1, each a mean over the image's pixels."""
     image = appearance.apply(rendered.colour, rendered.alpha)
     image, target = target.beside(image)
     error = image - target.colour
-    total = (1.0 - config.ssim) * error.abs().mean()
+    colour = error.abs().mean() + config.square * error.square().mean()
+    total = (1.0 - config.ssim) * colour
     if config.ssim > 0:
         total = total + config.ssim * (1.0 - target.similarity(image))
     if config.depth > 0:
