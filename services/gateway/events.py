@@ -25,7 +25,7 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """One thing that happened; `number` counts those of this gateway and session from 1."""
+    """One thing that happened; numbers only grow, also when the gateway is started again."""
 
     number: int
     kind: EventKind
@@ -38,7 +38,8 @@ class SessionEvents:
 
     def __init__(self) -> None:
         self._kept: deque[SessionEvent] = deque(maxlen=_KEPT)
-        self._number = 0
+        # Microseconds since 1970: what a watcher heard from an earlier life has smaller numbers.
+        self._number = time.time_ns() // 1000
         self._lost_frames = 0
 
     def add(self, kind: EventKind, **details: Any) -> None:
@@ -57,5 +58,6 @@ class SessionEvents:
             self._lost_frames = 0
 
     def after(self, number: int) -> list[SessionEvent]:
-        """The kept events after one, oldest first."""
-        return [event for event in self._kept if event.number > number]
+        """The kept events after one, oldest first; all of them after one that we never sent."""
+        is_ours = number <= self._number
+        return [event for event in self._kept if not is_ours or event.number > number]

