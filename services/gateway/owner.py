@@ -113,7 +113,7 @@ class MapOwner:
         while True:
             epoch = self.epoch
             try:
-                return await self._fabric.bus.ask(
+                reply = await self._fabric.bus.ask(
                     Keys.session(self.session, epoch, question), message, kind, timeout_s
                 )
             except GoneError:
@@ -124,6 +124,9 @@ class MapOwner:
                 if self.mapper in self._fabric.mappers.names:
                     raise
                 await self.reopen(epoch, deadline)
+            else:
+                self.lost.clear()  # back by itself, after a reopening that took too long
+                return reply
 
     async def ask_tracker(self, ask: Callable[[], Awaitable[T]], wait_s: float) -> T:
         """Ask a tracking worker, and again after opening a map whose owner it could not reach.

@@ -373,3 +373,12 @@ def test_a_text_message_on_the_stream_is_refused_and_the_stream_goes_on(gateway,
     assert refused.error is not None
     assert (refused.error.field, refused.error.reason) == ("message", "must be a binary message")
     assert answered.status is TrackingStatus.TRACKED
+
+
+def test_json_beyond_any_of_our_requests_is_refused_before_it_is_parsed(gateway):
+    body = b"[" * (5 << 20)
+
+    answer = httpx.post(f"{gateway.url}/v1/sessions", content=body)
+
+    assert answer.status_code == 413
+    assert "bytes of JSON" in answer.text
