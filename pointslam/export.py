@@ -25,7 +25,8 @@ def export_source(
         PointSlamError: there is no such run or session, or it cannot be exported.
     """
     folder = RunFolder(Path(source))
-    target = out or Path(f"{Path(source).name}{_suffix(format)}")
+    name = Path(source).resolve().name if folder.is_run() else source
+    target = out or Path(f"{name}{_suffix(format)}")
     if not folder.is_run():
         with Client(gateway) as client:
             _write(client.session(source), format, target)

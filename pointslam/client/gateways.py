@@ -16,7 +16,7 @@ class Gateways:
         listed = [urls] if isinstance(urls, str) else list(urls)
         if not listed:
             raise ConfigError("a client needs the address of a gateway")
-        self._urls = [url.rstrip("/") for url in listed]
+        self._urls = [_checked(url.rstrip("/")) for url in listed]
 
     def __len__(self) -> int:
         return len(self._urls)
@@ -29,6 +29,16 @@ class Gateways:
     def turn(self) -> None:
         """Use the next address; the present one comes last."""
         self._urls.append(self._urls.pop(0))
+
+
+def _checked(url: str) -> str:
+    try:
+        parsed = httpx.URL(url)
+    except httpx.InvalidURL as error:
+        raise ConfigError(f"the gateway's address {url!r} is no URL ({error})") from None
+    if parsed.scheme not in ("http", "https") or not parsed.host:
+        raise ConfigError(f"the gateway's address must be http(s)://host:port, got {url!r}")
+    return url
 
 
 def may_ask_again(error: httpx.TransportError, method: str) -> bool:

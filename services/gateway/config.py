@@ -60,6 +60,7 @@ class DispatchConfig:
 
     def __post_init__(self) -> None:
         _check_positive(self, "first_frame_timeout_s", "live_timeout_s", "offline_timeout_s")
+        _check_positive(self, "live_wait_s", "offline_wait_s", "idle_s")
         _check_positive(self, "patience_s", "patience_ratio", "quarantine_s")
         if self.load_cap < 1.0:
             raise ConfigError(f"load_cap must be at least 1, got {self.load_cap}")
@@ -84,6 +85,8 @@ class MappingConfig:
 
     def __post_init__(self) -> None:
         _check_positive(self, "advance_timeout_s", "question_timeout_s", "retry_s", "live_entries")
+        _check_positive(self, "open_timeout_s", "probe_timeout_s", "export_timeout_s")
+        _check_positive(self, "reopen_wait_s", "claim_wait_s", "keyframe_max_wait_s")
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,8 @@ class StreamConfig:
 
     def __post_init__(self) -> None:
         _check_positive(self, "credit", "live_unanswered", "send_timeout_s", "unread_s")
-        _check_positive(self, "poses", "max_gap_s")
+        _check_positive(self, "ping_interval_s", "ping_timeout_s", "event_interval_s")
+        _check_positive(self, "live_interval_s", "follow_interval_s", "poses", "max_gap_s")
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,9 @@ class GatewayConfig:
     drain_streams_s: float = 1.0  # then so long for the replies to frames that were taken,
     drain_s: float = 3.0  # so long for requests under way, and for what maps have not logged,
     drain_calls_s: float = 1.0  # and so long for calls over gRPC
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "session_idle_s", "path_keep_s")
 
     @property
     def ends_within_s(self) -> float:

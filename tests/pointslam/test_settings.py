@@ -65,6 +65,8 @@ def test_impossible_runs_are_refused(tmp_path, wrong):
         ["evaluate", "nowhere"],
         ["synth", "room", "--frames", "1"],
         ["export", "nothing", "--gateway", "http://127.0.0.1:9"],
+        ["export", "nothing", "--gateway", "http://127.0.0.1:80a"],
+        ["export", "nothing", "--gateway", "127.0.0.1:8080"],
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, words):

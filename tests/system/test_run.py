@@ -107,6 +107,15 @@ def test_a_run_is_exported_from_its_folder(metrics, options, tmp_path):
     assert target.read_text() == RunFolder(options.out).trajectory("final").read_text()
 
 
+def test_an_export_without_a_target_has_the_name_of_the_folder(metrics, options, monkeypatch):
+    monkeypatch.chdir(options.out)
+
+    code = main(["export", ".", "--format", "tum"])
+
+    assert code == 0
+    assert (options.out / f"{options.out.name}.txt").is_file()
+
+
 def test_no_run_needs_ground_truth(sequence, services, tmp_path):
     untrue = tmp_path / "untrue"
     shutil.copytree(sequence, untrue)
