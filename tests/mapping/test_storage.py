@@ -108,6 +108,17 @@ def test_damage_before_the_last_entry_is_an_error(written):
         list(read_log(written))
 
 
+@pytest.mark.parametrize("length", [b"\xff\xff\xff\x7f", b"\x01\x00\x00\x00"])
+def test_a_damaged_length_before_the_last_entry_is_an_error_and_no_torn_end(written, length):
+    data = bytearray(written.read_bytes())
+    second = 8 + int.from_bytes(data[:4], "little")
+    data[second : second + 4] = length
+    written.write_bytes(data)
+
+    with pytest.raises(StorageError, match=f"byte {second}"):
+        list(read_log(written))
+
+
 def test_a_full_disk_is_a_storage_error_and_leaves_the_log_whole(written, entry):
     log = SessionLog(written)
     size = written.stat().st_size

@@ -11,6 +11,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import IO
 
@@ -23,6 +24,9 @@ LOGGER = logging.getLogger(__name__)
 _HEAD = struct.Struct("<II")
 # How every entry without a keyframe ends: the last field of `Advance`, a name and nothing.
 _NO_KEYFRAME = codec.pack({"keyframe": None})[1:]
+# And how every entry begins: a map of its fields, and the first one's name.
+_FIELDS = fields(Advance)
+_FIRST_FIELD = codec.pack(dict.fromkeys(f.name for f in _FIELDS))[: 2 + len(_FIELDS[0].name)]
 
 
 class SessionLog:
@@ -72,7 +76,7 @@ def read_log(path: Path, end: int | None = None) -> Iterator[Advance]:
     """The entries of a log, up to byte `end`; leaves out a last one that a crash left torn.
 
     Raises:
-        StorageError: an entry before the last one fails its checksum.
+        StorageError: an entry before the last one fails its checksum, or its length is damaged.
     """
     with storage_errors(str(path)), path.open("rb") as file:
         size = _size(file, end)
@@ -80,6 +84,8 @@ def read_log(path: Path, end: int | None = None) -> Iterator[Advance]:
             payload = _read_payload(file, size)
             if payload is None and not _is_blank(file, size):
                 raise StorageError(f"{path}: the entry at byte {start} fails its checksum")
+            if payload is None and _is_followed(file, start, size):
+                raise StorageError(f"{path}: the entry at byte {start} has a damaged length")
             if payload is None:
                 LOGGER.warning("%s: %d bytes at the end are torn", path, size - start)
                 return
@@ -119,6 +125,23 @@ def _is_blank(file: IO[bytes], size: int) -> bool:
         if any(block):
             return False
     return True
+
+
+def _is_followed(file: IO[bytes], start: int, size: int) -> bool:
+    """Whether a whole entry lies behind the incomplete one at byte `start`.
+
+    A crash tears the last entry only: then its length is damaged, and entries that were
+    acknowledged would be lost with it. All payloads begin with the same bytes.
+    """
+    file.seek(start + _HEAD.size)
+    rest = file.read(max(0, size - file.tell()))
+    at = rest.find(_FIRST_FIELD, 1)
+    while at > 0:
+        length, checksum = _HEAD.unpack(rest[max(0, at - _HEAD.size) : at].rjust(_HEAD.size, b"\0"))
+        if 0 < length <= len(rest) - at and zlib.crc32(rest[at : at + length]) == checksum:
+            return True
+        at = rest.find(_FIRST_FIELD, at + 1)
+    return False
 
 
 def _read_payload(file: IO[bytes], size: int) -> bytes | None:
