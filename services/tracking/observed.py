@@ -84,8 +84,9 @@ class Observed:
         u, v = pixels.astype(np.int64).clip(0, [i.width - 1, i.height - 1]).T
         stays = ~moving[v, u]
         is_moving = moving if self.is_moving is None else moving | self.is_moving
-        pixels = self.features.keypoints_px.astype(np.int64)
-        on_it = np.flatnonzero(moving[pixels[:, 1], pixels[:, 0]] & (self.features.depths_m > 0.0))
+        pixels = np.rint(self.features.keypoints_px).astype(np.int64)
+        u, v = pixels.clip(0, [i.width - 1, i.height - 1]).T
+        on_it = np.flatnonzero(moving[v, u] & (self.features.depths_m > 0.0))
         appearance: Future[Appearance] = Future()
         rgb = self.appearance.result().rgb
         appearance.set_result(Appearance(rgb, detect(rgb, self.config.orb, ~is_moving)))

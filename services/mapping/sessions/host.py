@@ -31,7 +31,7 @@ from services.mapping.storage.log import count_keyframes
 from services.mapping.storage.retention import is_pinned, overdue, set_pinned, stored_session
 from services.mapping.storage.tenure import Lease, Tenure
 from shared.bus import Bus, Keys
-from shared.errors import NotFoundError, PointSlamError, StorageError, UnavailableError
+from shared.errors import NotFoundError, StorageError, UnavailableError
 from shared.maps import (
     DeleteRequest,
     Empty,
@@ -236,7 +236,7 @@ class MapperHost:
         try:
             folder, lease = self._claim(request)
             session = Session(folder, lease, surroundings)
-        except PointSlamError:
+        except Exception:  # also a fault of ours: another mapper may manage
             self._tenure.release(request.session)
             raise
         served = Served(session, ThreadPoolExecutor(1, thread_name_prefix="advance"))
