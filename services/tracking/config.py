@@ -212,9 +212,12 @@ class KeyframeRuleConfig:
     min_overlap: float = 0.75  # of its surface with the local map
     max_interval: int = 10  # frames, for mapping
     min_landmark_share: float = 0.35  # of its features with depth that match a landmark
+    few_landmarks: int = 120  # fewer agree, while more features wait for a second view
     max_cloud_points: int = 12000
-    min_points: int = 500  # with depth: less brings nothing to the map
+    min_points: int = 500  # with depth: less is no surface
+    min_landmarks: int = 50  # that hold a keyframe without a surface
     max_std_m: float = 0.03  # of its pose, in the direction that is known least
+    std_distance_m: float = 2.0  # of landmarks, beyond which it may be more in proportion
     max_std_deg: float = 1.5
     min_step_m: float = 0.02  # from the reference keyframe: less is the same view again
     min_turn_deg: float = 1.0
@@ -249,6 +252,19 @@ class BundleAdjustmentConfig:
 
 
 @dataclass(frozen=True)
+class TriangulationConfig:
+    """Landmarks from two keyframes, of features that have no depth."""
+
+    epipolar_px: float = 1.5  # from the line that the other view gives, at octave 0
+    min_parallax_deg: float = 1.0
+    max_hamming_bits: int = 50
+    ratio: float = 0.8
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "epipolar_px", "min_parallax_deg", "max_hamming_bits", "ratio")
+
+
+@dataclass(frozen=True)
 class TrackingConfig:
     """All of the tracking service."""
 
@@ -263,6 +279,7 @@ class TrackingConfig:
     loop: LoopVerificationConfig = field(default_factory=LoopVerificationConfig)
     keyframe: KeyframeRuleConfig = field(default_factory=KeyframeRuleConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     context_cache: int = 8  # contexts kept, over all sessions
     concurrent_frames: int = 2

@@ -67,6 +67,24 @@ def pose_covariance(
     return np.asarray(np.linalg.inv(weakened + np.eye(6)), np.float64)
 
 
+def is_well_known(estimate: Estimate, config: TrackingConfig) -> bool:
+    """Whether a pose is certain enough in every direction to hold a part of the map."""
+    covariance, limits = pose_covariance(estimate.information, config), config.keyframe
+    metres = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    degrees = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+    # Farther away the same error is fewer pixels, and less than what is seen there is known to.
+    scale = max(1.0, _distance_m(estimate) / limits.std_distance_m)
+    return metres <= limits.max_std_m * scale and degrees <= limits.max_std_deg
+
+
+def _distance_m(estimate: Estimate) -> float:
+    """Median distance of the landmarks that agree; zero without any."""
+    points = estimate.local.context.landmarks.positions_world[estimate.matches.landmarks]
+    if len(points) == 0:
+        return 0.0
+    return float(np.median(np.linalg.norm(points - estimate.T_world_camera[:3, 3], axis=1)))
+
+
 def attempt(
     observed: Observed,
     local: LocalMap,

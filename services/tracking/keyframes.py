@@ -39,6 +39,7 @@ class Coverage:
     T_reference_camera: NDArray[np.float64]  # [4, 4]
     median_depth_m: float
     step_deg: float  # turned since the last frame with a pose
+    waiting: int = 0  # features of no landmark where no depth is measured
 
     @property
     def turn_deg(self) -> float:
@@ -85,42 +86,39 @@ def becomes_keyframe(
 ) -> bool:
     """GS-ICP's overlap and interval rules and ORB-SLAM's feature rule.
 
-    Never a repeated view, and never one without enough depth to bring anything.
+    Never a repeated view, and without a surface only one that enough landmarks hold.
     """
     step_m = float(np.linalg.norm(coverage.T_reference_camera[:3, 3]))
     moved = step_m > config.min_step_m or coverage.turn_deg > config.min_turn_deg
     is_repeat = prior.frame_digest == frame.digest()
     if is_repeat or not (frame.may_be_keyframe and moved):
         return False
-    if coverage.num_points < config.min_points:
+    has_surface = coverage.num_points >= config.min_points
+    if not has_surface and coverage.landmarks < config.min_landmarks:
         return False
     return (
-        coverage.overlap < config.min_overlap
+        (has_surface and coverage.overlap < config.min_overlap)
         or coverage.landmark_share < config.min_landmark_share
+        or coverage.landmarks < min(config.few_landmarks, coverage.waiting)
         or prior.frames_since_keyframe + 1 >= config.max_interval
         or coverage.turn_deg > config.max_turn_deg
         or step_m > config.max_step_share * coverage.median_depth_m
     )
 
 
-def is_well_known(covariance: NDArray[np.float64], config: KeyframeRuleConfig) -> bool:
-    """Whether a pose is certain enough in every direction to hold a part of the map."""
-    metres = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-    degrees = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
-    return metres <= config.max_std_m and degrees <= config.max_std_deg
-
-
 def keyframe_observations(
     seq: int, features: Features, landmark_ids: NDArray[np.int64]
 ) -> Observations:
-    """All features of a keyframe; those with depth and no landmark yet found a new one.
+    """All features of a keyframe; those of no landmark yet found a new one.
+
+    Those without depth wait for another keyframe to place it.
 
     Args:
         seq: of the keyframe.
         features: all of the frame.
         landmark_ids: of the matched ones, NO_LANDMARK elsewhere, [M].
     """
-    founds = (landmark_ids == NO_LANDMARK) & (features.depths_m > 0.0)
+    founds = (landmark_ids == NO_LANDMARK) & ((features.depths_m > 0.0) | features.is_unmeasured)
     own = landmark_id(seq, np.arange(len(landmark_ids), dtype=np.int64))
     return Observations(
         landmark_ids=np.where(founds, own, landmark_ids),

@@ -31,6 +31,7 @@ class Features:
     octaves: NDArray[np.uint8]  # [M]
     descriptors: NDArray[np.uint8]  # [M, 32]
     depths_m: NDArray[np.float32]  # [M], 0 where none is reliable
+    is_unmeasured: NDArray[np.bool_]  # [M], no depth around it: not noisy, nor at an edge
 
     def points_camera(self, intrinsics: Intrinsics) -> NDArray[np.float64]:
         """Keypoints lifted by their depth, [M, 3]; zero where there is none."""
@@ -43,7 +44,11 @@ class Features:
     def rows(self, rows: NDArray[np.int64]) -> Features:
         """Some of them."""
         return Features(
-            self.keypoints_px[rows], self.octaves[rows], self.descriptors[rows], self.depths_m[rows]
+            self.keypoints_px[rows],
+            self.octaves[rows],
+            self.descriptors[rows],
+            self.depths_m[rows],
+            self.is_unmeasured[rows],
         )
 
     def joined(self, others: Features) -> Features:
@@ -53,6 +58,7 @@ class Features:
             np.concatenate([self.octaves, others.octaves]),
             np.concatenate([self.descriptors, others.descriptors]),
             np.concatenate([self.depths_m, others.depths_m]),
+            np.concatenate([self.is_unmeasured, others.is_unmeasured]),
         )
 
 
@@ -110,8 +116,10 @@ def with_depth(keypoints: Keypoints, depth_m: NDArray[np.float32], config: OrbCo
     """
     depths, spreads = _patches(depth_m, keypoints.keypoints_px, config.max_feature_depth_m)
     is_trusted = spreads <= _max_spread(spreads, config)
+    is_unmeasured = ~is_trusted & (depths == 0.0)
     depths = np.where(is_trusted, depths, np.float32(0.0))
-    return Features(keypoints.keypoints_px, keypoints.octaves, keypoints.descriptors, depths)
+    k = keypoints
+    return Features(k.keypoints_px, k.octaves, k.descriptors, depths, is_unmeasured)
 
 
 def _max_spread(spreads: NDArray[np.float64], config: OrbConfig) -> float:
@@ -126,8 +134,13 @@ def _max_spread(spreads: NDArray[np.float64], config: OrbConfig) -> float:
 def no_features() -> Features:
     """An image without any."""
     none = _no_keypoints()
-    depths_m = np.zeros(0, np.float32)
-    return Features(none.keypoints_px, none.octaves, none.descriptors, depths_m)
+    return Features(
+        none.keypoints_px,
+        none.octaves,
+        none.descriptors,
+        np.zeros(0, np.float32),
+        np.zeros(0, np.bool_),
+    )
 
 
 def _no_keypoints() -> Keypoints:
@@ -163,7 +176,7 @@ def _ranks_in_cells(pixels, cell_px):  # pragma: no cover - compiled
 def _patches(depth, pixels, max_depth):  # pragma: no cover - compiled
     """Mean depth of each keypoint's 3x3 patch, and how far its readings lie apart, relative.
 
-    Infinitely far where there are too few, or one of them is too far away.
+    Infinitely far where there are too few; no depth where one of them is too far away.
     """
     height, width = depth.shape
     depths, spreads = np.zeros(len(pixels), np.float32), np.full(len(pixels), np.inf)
@@ -176,6 +189,8 @@ def _patches(depth, pixels, max_depth):  # pragma: no cover - compiled
                 z = depth[vv, uu]
                 if z > 0.0:
                     low, high, total, count = min(low, z), max(high, z), total + z, count + 1
+        if count > 0 and high <= max_depth:
+            depths[n] = total / count
         if count >= 6 and high <= max_depth:
-            depths[n], spreads[n] = total / count, (high - low) / low
+            spreads[n] = (high - low) / low
     return depths, spreads

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.estimate import Estimate, pose_covariance
+from services.tracking.estimate import Estimate, is_well_known, pose_covariance
 from services.tracking.executors import NoHelper, taken_over
 from services.tracking.keyframes import (
     Coverage,
@@ -22,7 +22,6 @@ from services.tracking.keyframes import (
     Sharpness,
     becomes_keyframe,
     is_too_blurred,
-    is_well_known,
     keyframe_data,
     keyframe_observations,
     nearest_reference,
@@ -161,7 +160,7 @@ def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | No
     if prior is None or found.status is TrackingStatus.RELOCALISED:
         return None
     coverage = _coverage(observed, estimate, prior)
-    if not is_well_known(pose_covariance(estimate.information, config), config.keyframe):
+    if not is_well_known(estimate, config):
         return None
     if not becomes_keyframe(frame, prior, coverage, config.keyframe):
         return None
@@ -185,8 +184,10 @@ def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> Keyfr
     seq, T = job.request.frame.seq, estimate.T_world_camera
     new = NewKeyframe(seq, T, observations, estimate.registration)
     with job.clock.stage("bundle_adjustment"):
-        correction = adjust_window(new, context, observed.intrinsics, config)
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
+        adjusted = adjust_window(new, context, observed.intrinsics, config)
+    parts = KeyframeParts(
+        observed.image, observed.cloud, adjusted.observations, adjusted.correction
+    )
     link = KeyframeLink(context.reference_seq, context.revision, estimate.information)
     data = keyframe_data(parts, config.surface, config.keyframe)
     cells = None if observed.is_moving is None else cells_of(observed.is_moving)
@@ -206,16 +207,18 @@ def _loop(job: Job, estimate: Estimate, observations: Observations) -> LoopConst
 
 
 def _coverage(observed: Observed, estimate: Estimate, prior: Prior) -> Coverage:
-    with_depth = int((observed.features.depths_m > 0.0).sum())
+    is_known = observed.features.depths_m > 0.0
+    is_known[estimate.matches.features] = True
     T_world_reference = estimate.local.context.T_world_reference
     return Coverage(
         num_points=len(observed.cloud.points),
         overlap=estimate.registration.overlap,
         landmarks=estimate.inliers,
-        landmark_share=estimate.inliers / max(1, with_depth),
+        landmark_share=estimate.inliers / max(1, int(is_known.sum())),
         T_reference_camera=inverse(T_world_reference) @ estimate.T_world_camera,
         median_depth_m=_median_depth(observed),
         step_deg=step_between(prior.T_world_camera, estimate.T_world_camera).degrees,
+        waiting=int((observed.features.is_unmeasured & ~is_known).sum()),
     )
 
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from services.tracking.absolute_orientation import locate_by_points
 from services.tracking.config import TrackingConfig, VerificationConfig
-from services.tracking.estimate import Estimate, attempt, pose_covariance
-from services.tracking.keyframes import is_well_known
+from services.tracking.estimate import Estimate, attempt, is_well_known
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.moving import find_moving, known_moving
 from services.tracking.observed import Observed
@@ -84,10 +83,7 @@ def search(job: Job, local: LocalMap) -> Found:
 
 def _is_held(found: Found, config: TrackingConfig) -> bool:
     """Whether a pose is known well enough to go on from."""
-    if found.estimate is None:
-        return False
-    covariance = pose_covariance(found.estimate.information, config)
-    return is_well_known(covariance, config.keyframe)
+    return found.estimate is not None and is_well_known(found.estimate, config)
 
 
 def _search_nearby(job: Job, local: LocalMap) -> Found:

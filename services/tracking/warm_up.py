@@ -102,6 +102,7 @@ def _view_of_room(x_m: float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     cells = np.floor(points / 0.08 + 0.5).astype(np.int64)
     shade = (cells @ np.array([7919, 104729, 1299709])) * 2654435761 >> 7 & 0xFF
     rgb = np.repeat(shade.astype(np.uint8)[..., None], 3, axis=-1)
+    depth[: i.height // 4] = 0.0  # features there need a second view
     return np.ascontiguousarray(rgb), (1000.0 * depth).astype("<u2")
 
 
@@ -124,7 +125,7 @@ def _prior(x_m: float) -> Prior:
 def _context(keyframe: KeyframeData) -> TrackingContext:
     """The map after its first keyframe, at the origin."""
     observations, correction = keyframe.observations, keyframe.correction
-    rows = np.flatnonzero(observations.landmark_ids >= 0)
+    rows = np.flatnonzero(observations.depths_m > 0.0)
     landmarks = Landmarks(
         ids=correction.landmark_ids,
         positions_world=correction.positions_world,

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.tracking.bundle_adjustment import BundleProblem, BundleSolution, solve_bundle
+from services.tracking.bundle_adjustment import BundleProblem, solve_bundle
 from services.tracking.config import TrackingConfig
 from services.tracking.orb import backproject
 from services.tracking.registration import Registration, optimum
+from services.tracking.triangulation import triangulate
 from shared.camera import Intrinsics
 from shared.se3 import inverse, transform
 from shared.tracks import (
@@ -36,6 +37,14 @@ class NewKeyframe:
 
 
 @dataclass(frozen=True)
+class AdjustedKeyframe:
+    """A keyframe after bundle adjustment."""
+
+    observations: Observations  # with the earlier keyframes' landmarks that it placed
+    correction: Correction
+
+
+@dataclass(frozen=True)
 class _Observed:
     """Observations of several cameras in one list, by ascending landmark."""
 
@@ -50,12 +59,12 @@ def adjust_window(
     context: TrackingContext,
     intrinsics: Intrinsics,
     config: TrackingConfig,
-) -> Correction:
+) -> AdjustedKeyframe:
     """Adjust the new keyframe with its window and place the landmarks that it found.
 
-    Returns:
-        new poses of the window's free keyframes and of this one (last), new positions of the
-        adjusted landmarks and first positions of the new ones.
+    Features without depth become landmarks where an earlier keyframe sees them too. The correction
+    has new poses of the window's free keyframes and of this one (last), new
+    positions of the adjusted landmarks and first positions of the new ones.
     """
     window = (*context.window, _as_window(keyframe))
     observed = _observed(window, context.landmarks, config)
@@ -73,7 +82,28 @@ def adjust_window(
         sigmas=observed.sigmas,
     )
     solution = solve_bundle(problem, intrinsics, config.bundle_adjustment)
-    return _correction(window, problem, solution, context.landmarks.ids[seen], intrinsics)
+    poses = solution.T_world_cameras
+    *adjusted, new = (replace(w, T_world_camera=T) for w, T in zip(window, poses, strict=True))
+    placed = triangulate(new, tuple(adjusted), intrinsics, config.triangulation)
+    seen_again = (context.landmarks.ids[seen], solution.points_world)
+    own = _own_landmarks(new.seq, new.T_world_camera, new.observations, intrinsics)
+    correction = _correction(
+        [keyframe for keyframe in (*adjusted, new) if not keyframe.is_fixed],
+        [seen_again, own, (placed.landmark_ids, placed.positions_world)],
+    )
+    return AdjustedKeyframe(placed.named(new.observations), correction)
+
+
+_Placed = tuple[NDArray[np.int64], NDArray[np.float64]]  # ids [L], positions in the world [L, 3]
+
+
+def _correction(moved: list[WindowKeyframe], placed: list[_Placed]) -> Correction:
+    return Correction(
+        keyframe_seqs=np.array([keyframe.seq for keyframe in moved], np.int64),
+        T_world_keyframes=np.stack([keyframe.T_world_camera for keyframe in moved]),
+        landmark_ids=np.concatenate([ids for ids, _ in placed]),
+        positions_world=np.concatenate([positions for _, positions in placed]),
+    )
 
 
 def _as_window(keyframe: NewKeyframe) -> WindowKeyframe:
@@ -98,10 +128,10 @@ def _own_landmarks(
     T_world_camera: NDArray[np.float64],
     observations: Observations,
     intrinsics: Intrinsics,
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Ids and positions of the landmarks that a keyframe founds."""
+) -> _Placed:
+    """Ids and positions of the landmarks that a keyframe founds with its depth."""
     ids = observations.landmark_ids
-    own = np.flatnonzero((ids >= 0) & ((ids >> KEYPOINT_BITS) == seq))
+    own = np.flatnonzero(((ids >> KEYPOINT_BITS) == seq) & (observations.depths_m > 0.0))
     points = backproject(observations.keypoints_px[own], observations.depths_m[own], intrinsics)
     return ids[own], transform(T_world_camera, points)
 
@@ -185,26 +215,6 @@ def pose_information(
 
 
 _CLOUD_STEP = 4
-
-
-def _correction(
-    window: tuple[WindowKeyframe, ...],
-    problem: BundleProblem,
-    solution: BundleSolution,
-    adjusted_ids: NDArray[np.int64],
-    intrinsics: Intrinsics,
-) -> Correction:
-    free = np.flatnonzero(~problem.is_fixed)
-    new = window[-1]
-    ids, positions = _own_landmarks(
-        new.seq, solution.T_world_cameras[-1], new.observations, intrinsics
-    )
-    return Correction(
-        keyframe_seqs=np.array([window[k].seq for k in free], np.int64),
-        T_world_keyframes=solution.T_world_cameras[free],
-        landmark_ids=np.concatenate([adjusted_ids, ids]),
-        positions_world=np.concatenate([solution.points_world, positions]),
-    )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -216,6 +216,98 @@ def test_windows_observe_what_moves_too():
     assert (window[0].observations.landmark_ids == MOVING).sum() == 0
 
 
+def waiting(store: KeyframeStore, seq: int) -> np.ndarray:
+    """Ids in a keyframe's part of the newest window that no landmark of the context has."""
+    context = store.context(-1)
+    seen = next(k.observations for k in context.window if k.seq == seq)
+    return seen.landmark_ids[~np.isin(seen.landmark_ids, context.landmarks.ids)]
+
+
+def without_depth(data: KeyframeData, seq: int, count: int) -> KeyframeData:
+    """A keyframe whose last features have no depth, so that their landmarks are nowhere yet."""
+    seen, correction = data.observations, data.correction
+    ids, depths_m = seen.landmark_ids.copy(), seen.depths_m.copy()
+    ids[-count:], depths_m[-count:] = landmark_id(seq, np.arange(900, 900 + count)), 0.0
+    return dataclasses.replace(
+        data,
+        observations=dataclasses.replace(seen, landmark_ids=ids, depths_m=depths_m),
+        correction=dataclasses.replace(
+            correction,
+            landmark_ids=correction.landmark_ids[:-count],
+            positions_world=correction.positions_world[:-count],
+        ),
+    )
+
+
+def walk_without_depth(config: ContextConfig | None = None) -> KeyframeStore:
+    store = KeyframeStore(KeyframeConfig(context=config or ContextConfig()))
+    for index in range(4):
+        data = without_depth(keyframe(index), 10 * index, 20)
+        store.insert(10 * index, index, pose(index), data)
+    return store
+
+
+def test_windows_observe_what_has_no_place_yet():
+    np.testing.assert_array_equal(
+        waiting(walk_without_depth(), 10), landmark_id(10, np.arange(900, 920))
+    )
+
+
+def test_only_the_newest_of_a_window_have_it():
+    store = walk_without_depth(ContextConfig(max_waiting_keyframes=2))
+
+    assert [len(waiting(store, seq)) for seq in (0, 10, 20, 30)] == [0, 0, 20, 20]
+
+
+def test_it_is_a_landmark_once_a_keyframe_places_it():
+    store = walk_without_depth()
+    placed = landmark_id(10, np.arange(900, 910))
+    last = keyframe(4)
+    correction = last.correction
+    last = dataclasses.replace(
+        last,
+        correction=dataclasses.replace(
+            correction,
+            landmark_ids=np.concatenate([correction.landmark_ids, placed]),
+            positions_world=np.concatenate([correction.positions_world, np.ones((10, 3))]),
+        ),
+        observations=dataclasses.replace(
+            last.observations,
+            landmark_ids=np.concatenate([placed, last.observations.landmark_ids[10:]]),
+        ),
+    )
+    store.insert(40, 4, pose(4), last)
+
+    landmarks = store.context(-1).landmarks
+
+    assert np.isin(placed, landmarks.ids).all()
+    np.testing.assert_array_equal(landmarks.positions_world[np.isin(landmarks.ids, placed)], 1.0)
+    assert len(waiting(store, 10)) == 10
+
+
+def blind(index: int) -> KeyframeData:
+    """A keyframe without a surface."""
+    none = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    return dataclasses.replace(keyframe(index), cloud_camera=none)
+
+
+def test_a_keyframe_without_surface_is_near_to_those_that_saw_its_landmarks():
+    store = walk(3)
+    store.insert(30, 3, pose(3), blind(3))
+
+    context = store.context(30)
+
+    assert [keyframe.seq for keyframe in context.window] == [0, 10, 20, 30]
+    assert len(context.cloud_world.points) > 1000
+
+
+def test_it_takes_part_in_the_neighbourhood_of_others():
+    store = walk(3)
+    store.insert(30, 3, pose(3), blind(3))
+
+    assert 30 in [keyframe.seq for keyframe in store.context(20).window]
+
+
 def test_one_revision_and_reference_have_one_context():
     store = walk(10, noise_m=0.01)
 
@@ -245,7 +337,13 @@ def test_opposite_sides_of_a_thin_wall_are_not_averaged():
 
 
 @pytest.mark.parametrize(
-    "change", [{"voxel_size_m": 0.0}, {"max_keyframes": 0}, {"max_landmarks": 0}]
+    "change",
+    [
+        {"voxel_size_m": 0.0},
+        {"max_keyframes": 0},
+        {"max_landmarks": 0},
+        {"max_waiting_keyframes": 0},
+    ],
 )
 def test_settings_out_of_range_are_refused(change):
     with pytest.raises(ConfigError):

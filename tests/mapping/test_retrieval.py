@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from services.mapping.keyframes.context import StoredKeyframe, ViewCone
 from services.mapping.keyframes.retrieval import (
     RetrievalConfig,
     rank_keyframes,
     thumbnail_correlation,
 )
+from services.mapping.keyframes.stored import StoredKeyframe, ViewCone
 from shared.errors import ConfigError
 from shared.tracks import Observations, PointCloud
 

@@ -99,6 +99,8 @@ def test_a_well_covered_frame_is_no_keyframe(room):
     [
         {"overlap": 0.6},
         {"landmark_share": 0.1},
+        {"landmarks": 80, "waiting": 100},
+        {"num_points": 0, "landmark_share": 0.1},
         {"T_reference_camera": exp([0.1, 0.0, 0.0, 0.0, 0.4, 0.0])},
         {"T_reference_camera": exp([0.6, 0.0, 0.0, 0.0, 0.0, 0.0])},
     ],
@@ -107,6 +109,21 @@ def test_a_frame_that_shows_something_new_is_one(room, change):
     coverage = dataclasses.replace(WELL_COVERED, **change)
 
     assert becomes_keyframe(frame_at(room, 800), prior(), coverage, KeyframeRuleConfig())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"landmarks": 80, "waiting": 70},
+        {"landmarks": 130, "waiting": 800},
+        {"num_points": 0, "overlap": 0.0},  # no surface is nothing new
+        {"num_points": 400, "overlap": 0.1, "landmarks": 40, "landmark_share": 0.1},
+    ],
+)
+def test_a_frame_that_brings_little_or_is_held_by_little_is_none(room, change):
+    coverage = dataclasses.replace(WELL_COVERED, **change)
+
+    assert not becomes_keyframe(frame_at(room, 800), prior(), coverage, KeyframeRuleConfig())
 
 
 def test_the_tenth_frame_since_the_last_keyframe_is_one(room):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from services.mapping.keyframes.context import LandmarkTable, StoredKeyframe, ViewCone
+from services.mapping.keyframes.stored import LandmarkTable, StoredKeyframe, ViewCone
 from shared.tracks import Observations, PointCloud
 
 Arrays = Mapping[str, np.ndarray]

@@ -6,13 +6,14 @@ reference always give the same context, in whichever process and after whichever
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.anchors.membership import is_among
+from services.mapping.keyframes.stored import LandmarkTable, StoredKeyframe
 from services.mapping.keyframes.voxel_merge import merge_clouds
 from shared.errors import ConfigError
 from shared.free_space import seen_through
@@ -27,6 +28,14 @@ from shared.tracks import (
     WindowKeyframe,
 )
 
+_AT_LEAST_ONE = (
+    "max_keyframes",
+    "max_points",
+    "max_landmarks",
+    "max_free_keyframes",
+    "max_waiting_keyframes",
+)
+
 
 @dataclass(frozen=True)
 class ContextConfig:
@@ -39,67 +48,16 @@ class ContextConfig:
     max_landmarks: int = 4000
     max_free_keyframes: int = 8  # of the bundle-adjustment window
     max_fixed_keyframes: int = 7
+    max_waiting_keyframes: int = 5  # the newest of the window, with features that have no place
     min_shared_landmarks: int = 15  # with the reference, for a place in the window
     overlap_samples: int = 256
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.voxel_size_m <= 1.0:
             raise ConfigError(f"voxel_size_m must be 0.001 to 1, got {self.voxel_size_m}")
-        for name in ("max_keyframes", "max_points", "max_landmarks", "max_free_keyframes"):
+        for name in _AT_LEAST_ONE:
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class ViewCone:
-    """What a keyframe can see, from its cloud: bounds of x/z and y/z, and depths."""
-
-    low: NDArray[np.float64]  # [2]
-    high: NDArray[np.float64]  # [2]
-    far_m: float
-    median_m: float
-
-    @staticmethod
-    def of(cloud_camera: PointCloud) -> ViewCone:
-        """The cone of a cloud; of an empty cloud, a cone that sees nothing."""
-        points = cloud_camera.points.astype(np.float64)
-        if len(points) == 0:
-            return ViewCone(np.zeros(2), np.zeros(2), 0.0, 1.0)
-        slopes = points[:, :2] / points[:, 2:]
-        depths = points[:, 2]
-        return ViewCone(
-            slopes.min(axis=0), slopes.max(axis=0), float(depths.max()), float(np.median(depths))
-        )
-
-
-@dataclass(frozen=True)
-class StoredKeyframe:
-    """A keyframe as the map keeps it."""
-
-    seq: int
-    t_ns: int
-    T_world_camera: NDArray[np.float64]  # [4, 4], as corrected last
-    observations: Observations
-    cloud_camera: PointCloud
-    thumbnail: NDArray[np.uint8]  # [15, 20]
-    cone: ViewCone
-    edge_blur_px: float = 0.0
-
-
-@dataclass(frozen=True)
-class LandmarkTable:
-    """All landmarks of a map, by ascending id."""
-
-    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [L]
-    positions_world: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    normals_world: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-
-    def rows(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The row of each id; -1 where the table does not hold it."""
-        if len(self.ids) == 0:
-            return np.full(len(ids), -1, np.int64)
-        rows = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return np.where(self.ids[rows] == ids, rows, -1)
 
 
 def empty_context(revision: int) -> TrackingContext:
@@ -138,7 +96,7 @@ def build_context(
         T_world_reference=around.reference.T_world_camera,
         cloud_world=_merged_cloud(near, config),
         landmarks=landmarks_seen(table, near, ids),
-        window=_window(near, ids, around.first_seq, config),
+        window=_window(near, (table, ids), around.first_seq, config),
         num_keyframes=around.num_keyframes,
         loop_seqs=np.array(around.loop_seqs, np.int64),
     )
@@ -147,16 +105,29 @@ def build_context(
 def overlapping(
     reference: StoredKeyframe, keyframes: list[StoredKeyframe], config: ContextConfig
 ) -> list[StoredKeyframe]:
-    """The keyframes that see most of the reference's surface, itself first."""
+    """The keyframes that see most of the reference's surface, itself first.
+
+    Where one of two has no surface, most of the reference's landmarks.
+    """
     cloud = reference.cloud_camera
     step = max(1, len(cloud.points) // config.overlap_samples)
     points = transform(reference.T_world_camera, cloud.points[::step].astype(np.float64))
     normals = rotate(reference.T_world_camera, cloud.normals[::step].astype(np.float64))
     shares = visible_shares(points, normals, keyframes)
+    for i, keyframe in enumerate(keyframes):
+        if min(len(cloud.points), len(keyframe.cloud_camera.points)) == 0:
+            shares[i] = _shared_landmarks(reference, keyframe)
     order = np.argsort(-shares, kind="stable")
     chosen = [keyframes[i] for i in order if shares[i] >= config.min_overlap]
     others = [keyframe for keyframe in chosen if keyframe.seq != reference.seq]
     return [reference, *others[: config.max_keyframes - 1]]
+
+
+def _shared_landmarks(reference: StoredKeyframe, other: StoredKeyframe) -> float:
+    """Share of the reference's features with a landmark that another keyframe saw."""
+    ids = reference.observations.landmark_ids
+    ids = ids[ids >= 0]
+    return float(is_among(ids, other.observations.landmark_ids).mean()) if len(ids) else 0.0
 
 
 def visible_shares(
@@ -261,7 +232,10 @@ def _rows_of(
 
 
 def _window(
-    near: list[StoredKeyframe], ids: NDArray[np.int64], first_seq: int, config: ContextConfig
+    near: list[StoredKeyframe],
+    landmarks: tuple[LandmarkTable, NDArray[np.int64]],
+    first_seq: int,
+    config: ContextConfig,
 ) -> tuple[WindowKeyframe, ...]:
     """Bundle-adjustment window: the reference, then the keyframes that share most landmarks."""
     reference_ids = near[0].observations.landmark_ids
@@ -275,26 +249,36 @@ def _window(
     # Something must hold the window in place: the first keyframe, or else the oldest.
     fixed_seqs = {k.seq for k in fixed} | {first_seq}
     fixed_seqs |= set() if fixed else {members[0].seq}
+    newest = {keyframe.seq for keyframe in members[-config.max_waiting_keyframes :]}
     return tuple(
         WindowKeyframe(
             seq=keyframe.seq,
             T_world_camera=keyframe.T_world_camera,
             is_fixed=keyframe.seq in fixed_seqs,
-            observations=_observations_of(keyframe.observations, ids),
+            observations=_observations_of(keyframe, landmarks, keyframe.seq in newest),
             edge_blur_px=keyframe.edge_blur_px,
         )
         for keyframe in members
     )
 
 
-def _observations_of(observations: Observations, ids: NDArray[np.int64]) -> Observations:
-    """Those of the given landmarks, whose ids ascend, and of what moves."""
-    _, known = _rows_of(ids, observations.landmark_ids)
-    rows = np.concatenate([known, np.flatnonzero(observations.landmark_ids == MOVING)])
+def _observations_of(
+    keyframe: StoredKeyframe,
+    landmarks: tuple[LandmarkTable, NDArray[np.int64]],
+    with_waiting: bool,
+) -> Observations:
+    """Those of the context's landmarks, of what moves and, if wanted, of what has no place yet."""
+    table, ids = landmarks
+    seen = keyframe.observations
+    keep = is_among(seen.landmark_ids, ids) | (seen.landmark_ids == MOVING)
+    if with_waiting:
+        own = (seen.landmark_ids >> KEYPOINT_BITS) == keyframe.seq
+        keep |= own & (table.rows(seen.landmark_ids) < 0)
+    rows = np.flatnonzero(keep)
     return Observations(
-        landmark_ids=observations.landmark_ids[rows],
-        keypoints_px=observations.keypoints_px[rows],
-        octaves=observations.octaves[rows],
-        depths_m=observations.depths_m[rows],
-        descriptors=observations.descriptors[rows],
+        landmark_ids=seen.landmark_ids[rows],
+        keypoints_px=seen.keypoints_px[rows],
+        octaves=seen.octaves[rows],
+        depths_m=seen.depths_m[rows],
+        descriptors=seen.descriptors[rows],
     )

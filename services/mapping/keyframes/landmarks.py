@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.anchors.membership import is_among
-from services.mapping.keyframes.context import LandmarkTable
+from services.mapping.keyframes.stored import LandmarkTable
 from shared.se3 import rotate, transform
 from shared.tracks import KEYPOINT_BITS, KeyframeData, Observations
 

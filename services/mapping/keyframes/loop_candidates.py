@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.mapping.keyframes.context import StoredKeyframe, visible_shares
+from services.mapping.keyframes.context import visible_shares
 from services.mapping.keyframes.retrieval import count_alike, thumbnail_correlation
+from services.mapping.keyframes.stored import StoredKeyframe
 from shared.errors import ConfigError
 from shared.se3 import rotate, transform
 

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mapping.keyframes.context import StoredKeyframe
 from services.mapping.keyframes.graph import Edge, EdgeKind, KeyframeGraph, Way, linked_keyframes
 from services.mapping.keyframes.landmarks import one_to_one
 from services.mapping.keyframes.loop_config import LoopConfig
@@ -24,6 +23,7 @@ from services.mapping.keyframes.loops import (
     waiting_of,
 )
 from services.mapping.keyframes.pose_graph import PoseGraph, solve_pose_graph
+from services.mapping.keyframes.stored import StoredKeyframe
 from shared.se3 import angle_rad, inverse
 from shared.tracks import KeyframeData, KeyframeLink
 

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mapping.keyframes.context import StoredKeyframe
+from services.mapping.keyframes.stored import StoredKeyframe
 from shared.errors import ConfigError
 from shared.se3 import angle_rad, inverse
 

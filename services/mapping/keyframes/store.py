@@ -16,10 +16,7 @@ from services.mapping.keyframes.arrays import (
 )
 from services.mapping.keyframes.context import (
     ContextConfig,
-    LandmarkTable,
     Neighbourhood,
-    StoredKeyframe,
-    ViewCone,
     build_context,
     empty_context,
     landmarks_seen,
@@ -30,6 +27,7 @@ from services.mapping.keyframes.loop_closing import LoopCloser
 from services.mapping.keyframes.loop_config import LoopConfig
 from services.mapping.keyframes.loops import Poses, SeenLoop
 from services.mapping.keyframes.retrieval import RetrievalConfig, nearest_view, rank_keyframes
+from services.mapping.keyframes.stored import LandmarkTable, StoredKeyframe, ViewCone
 from shared.errors import ConflictError, NotFoundError
 from shared.se3 import rotate
 from shared.tracks import (
