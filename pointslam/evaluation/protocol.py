@@ -58,7 +58,7 @@ class ViewScore:
     depth_l1_m: float | None
     lpips: float | None
     masked_psnr_db: float | None
-    masked_ssim: float
+    masked_ssim: float | None
     masked_lpips: float | None
     psnr_seen_db: float | None
     seen: float  # share of pixels with rendered alpha above 0.9
@@ -177,15 +177,16 @@ def _score(task: _Task, reply: RenderReply, output: EvaluationOutput) -> ViewSco
     is_seen = reply.alpha > _SEEN_ALPHA
     ours, theirs = images.masked(reply.rgb, truth.depth_m), images.masked(truth.rgb, truth.depth_m)
     lpips = output.lpips or (lambda *_: None)
+    has_depth = bool((truth.depth_m > 0).any())  # black beside black is no picture
     return ViewScore(
         index=task.index,
         psnr_db=images.psnr_db(reply.rgb, truth.rgb),
         ssim=images.ssim(reply.rgb, truth.rgb),
         depth_l1_m=images.depth_l1_m(reply.depth_m, reply.alpha, truth.depth_m),
         lpips=lpips(reply.rgb, truth.rgb),
-        masked_psnr_db=images.psnr_db(ours, theirs),
-        masked_ssim=images.ssim(ours, theirs),
-        masked_lpips=lpips(ours, theirs),
+        masked_psnr_db=images.psnr_db(ours, theirs) if has_depth else None,
+        masked_ssim=images.ssim(ours, theirs) if has_depth else None,
+        masked_lpips=lpips(ours, theirs) if has_depth else None,
         psnr_seen_db=images.psnr_db(reply.rgb, truth.rgb, is_seen),
         seen=float(is_seen.mean()),
     )

@@ -127,8 +127,8 @@ class Mapper:
             carve(self.anchors, image, pose, config)
             is_uncovered = self._look_at(keyframe, image)
             landmarks, exposure = keyframe.landmarks_world, self.exposures.of(keyframe.frame.seq)
-            image = with_guesses(image, pose, self.sightings, self.views.all(), config)
             request = SeedRequest(image, pose, is_uncovered, landmarks, exposure)
+            request = with_guesses(request, self.sightings, self.views.all(), config)
             new = seed_anchors(request, self.anchors.keys(), config, self._rng)
             self.revision = keyframe.poses.revision
             added = self.anchors.append(new, keyframe.frame.seq)

@@ -130,6 +130,7 @@ class VerificationConfig:
     coarse_max_step_deg: float = 15.0
     explained_min_agreement: float = 0.95  # by geometry alone: no other start will do better
     explained_min_overlap: float = 0.4
+    brief_lost_frames: int = 3  # after more, a pose nearby must be as sure as one anywhere
     max_step_m: float = 1.0
     max_step_deg: float = 50.0
 

@@ -196,13 +196,16 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
     prior, config = job.request.prior, job.config.verification
     assert prior is not None
     frames = 1 + prior.lost_frames
-    T = estimate.T_world_camera
-    is_possible = is_possible_step(prior.T_world_camera, T, frames, config)
-    if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
+    is_possible = is_possible_step(prior.T_world_camera, estimate.T_world_camera, frames, config)
+    if prior.lost_frames > config.brief_lost_frames:
+        is_believed = is_found(job.observed, estimate, job.config)
+    else:
+        is_believed = is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config))
+    if is_believed:
         return TrackingStatus.TRACKED
-    T_predicted = predict(prior, job.request.frame)
     if prior.lost_frames > 0:
         return TrackingStatus.LOST
+    T_predicted = predict(prior, job.request.frame)
     if is_coarse(estimate, T_predicted, config) or (is_possible and is_only_seen(estimate, config)):
         return TrackingStatus.COARSE_ONLY
     return TrackingStatus.LOST

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 
+import cv2
 import numpy as np
 import pytest
 
-from pointslam.datasets import SequenceOptions
+from pointslam.datasets import SequenceOptions, open_sequence
 from pointslam.evaluation.evaluate import Evaluation, write_evaluation
 from pointslam.evaluation.metrics import (
     image_entries,
@@ -98,6 +100,20 @@ def test_no_truth_means_no_novel_scores(room, lit_scene, room_options, tmp_path)
     scores = score_run(SceneMap(lit_scene, room_options), room, poses, None, output)
 
     assert image_entries(scores, 8)["novel"]["psnr_db"] is None
+
+
+def test_without_depth_there_is_no_score_over_it(room, lit_scene, room_options, tmp_path):
+    shutil.copytree(room.path, tmp_path / "blind")
+    for path in (tmp_path / "blind" / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+    blind = open_sequence(tmp_path / "blind")
+    output = EvaluationOutput(tmp_path, 8, lambda done, total: None)
+
+    scores = score_run(SceneMap(lit_scene, room_options), blind, {0: np.eye(4)}, None, output)
+
+    entries = image_entries(scores, 8)
+    assert (entries["gsicp"]["psnr_db"], entries["gsicp"]["ssim"]) == (None, None)
+    assert entries["all"]["psnr_db"] is not None
 
 
 def test_a_perceptual_distance_is_null_unless_one_is_given(

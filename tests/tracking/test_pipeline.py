@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from services.tracking.config import OrbConfig, TrackingConfig, VerificationConfig
 from shared.errors import InputError
 from shared.frames import ColourEncoding, ColourImage, DepthEncoding, DepthImage, TrackingStatus
 from shared.se3 import angle_rad, exp, inverse
@@ -82,6 +83,23 @@ def test_a_lost_frame_stays_where_it_was_told_beside_its_keyframe(room, session)
     T_world_camera = session.store.pose(result.reference_seq) @ result.T_reference_camera
 
     np.testing.assert_allclose(T_world_camera, before.T_world_camera, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lost_frames", "status"), [(2, TrackingStatus.TRACKED), (6, TrackingStatus.LOST)]
+)
+def test_after_a_while_a_few_features_nearby_do_not_bring_the_camera_back(
+    room, new_session, lost_frames, status
+):
+    few = TrackingConfig(  # enough to go on, not to be found by
+        orb=OrbConfig(num_features=38), verification=VerificationConfig(min_inliers=5)
+    )
+    session = new_session(config=few)
+    walk(room, session, 3)
+    for i in range(3, 3 + lost_frames):
+        session.track(blind(room.frame(i, path(3))))
+
+    assert session.track(room.frame(3 + lost_frames, path(3))).status is status
 
 
 def test_tracking_goes_on_after_blind_frames(room, session):

@@ -1,8 +1,8 @@
 """Depth for a new keyframe's pixels that the sensor left out, in no other keyframe's free space.
 
-The first guess is the depth around a hole. Where other keyframes look through that point at
-something behind it, the guess would hang before what they see: it goes further along its ray,
-until no keyframe looks through it any more.
+The first guess is the depth around a hole, and of the landmarks in it. Where other keyframes look
+through that point at something behind it, the guess would hang before what they see: it goes
+further along its ray, until no keyframe looks through it any more.
 """
 
 from __future__ import annotations
@@ -14,40 +14,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapping.anchors.depth_fill import filled_depth
+from services.mapping.anchors.seeding import SeedRequest
 from services.mapping.config import AnchorConfig
 from services.mapping.views.sightings import CoarseDepths, Sightings
 from services.mapping.views.training_views import TrainingView
 from shared import se3
-from shared.rectify import RgbdImage
 
 _FURTHER = (1.0, 1.2, 1.5, 2.0)  # times the first guess; beyond the last, there is none
+_NEAREST_M = 0.1
 _STEP_PX = 4  # of a row and column, between the pixels that are looked at
 _PROBE_STEP = 24  # of those, between the points that keyframes are chosen by
 
 
 def with_guesses(
-    image: RgbdImage,
-    T_world_camera: NDArray[np.float64],
-    sightings: Sightings,
-    keyframes: list[TrainingView],
-    config: AnchorConfig,
-) -> RgbdImage:
-    """The image with guesses for the depth that it lacks; 0 stays where none fits.
+    request: SeedRequest, sightings: Sightings, keyframes: list[TrainingView], config: AnchorConfig
+) -> SeedRequest:
+    """The request with guesses for the depth that its image lacks; 0 stays where none fits.
 
     Args:
-        T_world_camera: pose of the image.
+        request: a new keyframe's.
+        sightings: what the keyframes measured.
         keyframes: all of the map.
         config: whether to guess; how far behind a point a reading is that looks through it.
     """
     if not config.fill_holes:
-        return image
-    filled_m, camera = filled_depth(image.depth_m), image.intrinsics
+        return request
+    image, T_world_camera, camera = request.image, request.T_world_camera, request.image.intrinsics
+    filled_m = filled_depth(_with_landmarks(request))
     if image.moving is not None:  # what is behind is not guessed
         filled_m = np.where(image.moving, np.float32(0.0), filled_m)
     grid = slice(_STEP_PX // 2, None, _STEP_PX)
     rows, columns = np.nonzero((image.depth_m[grid, grid] == 0) & (filled_m[grid, grid] > 0))
     if len(rows) == 0:
-        return replace(image, depth_m=filled_m)
+        return _with_depth(request, filled_m)
     v, u = rows * _STEP_PX + _STEP_PX // 2, columns * _STEP_PX + _STEP_PX // 2
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
     points = rays * filled_m[v, u][:, None]
@@ -56,7 +55,26 @@ def with_guesses(
     factors = np.ones(filled_m[grid, grid].shape, np.float32)
     factors[rows, columns] = _factors(points, T_world_camera, depths, config)
     guesses_m = filled_m * _spread(factors, filled_m.shape)
-    return replace(image, depth_m=np.where(image.depth_m > 0, image.depth_m, guesses_m))
+    return _with_depth(request, np.where(image.depth_m > 0, image.depth_m, guesses_m))
+
+
+def _with_depth(request: SeedRequest, depth_m: NDArray[np.float32]) -> SeedRequest:
+    return replace(request, image=replace(request.image, depth_m=depth_m))
+
+
+def _with_landmarks(request: SeedRequest) -> NDArray[np.float32]:
+    """The depth image with that of the keyframe's landmarks where it has none, [H, W]."""
+    image, i = request.image, request.image.intrinsics
+    points = se3.transform(se3.inverse(request.T_world_camera), request.landmarks_world)
+    points = points[points[:, 2] > _NEAREST_M]
+    pixels = points[:, :2] / points[:, 2:] * [i.fx, i.fy] + [i.cx + 0.5, i.cy + 0.5]
+    u, v = np.floor(pixels).astype(np.int64).T
+    inside = (u >= 0) & (v >= 0) & (u < i.width) & (v < i.height)
+    u, v, z = u[inside], v[inside], points[inside, 2]
+    is_empty = image.depth_m[v, u] == 0
+    depth_m = image.depth_m.copy()
+    depth_m[v[is_empty], u[is_empty]] = z[is_empty]
+    return depth_m
 
 
 def _spread(factors: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
