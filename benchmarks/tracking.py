@@ -4,6 +4,7 @@ Times are a worker's on a map whose owner has the next neighbourhood ready: from
 to the answer, with the waiting for what is fetched, unpacked and derived beside.
 
 python -m benchmarks.tracking SEQUENCE... [--frames N] [--stride N] [--json FILE] [--alone]
+    [--max-depth-m M] [--depth-frames N]
 """
 
 from __future__ import annotations
@@ -86,6 +87,8 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("sequences", nargs="*", type=Path)
     parser.add_argument("--frames", type=int, help="at most so many")
     parser.add_argument("--stride", type=int, default=1, help="use every so many")
+    parser.add_argument("--max-depth-m", type=float, help="of a sensor that does not see farther")
+    parser.add_argument("--depth-frames", type=int, help="only the first so many have depth")
     parser.add_argument("--alone", action="store_true", help="without ablation and peers")
     parser.add_argument("--json", nargs="?", const="-", help="to a file, or instead of the table")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -94,7 +97,7 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
 
 def _measure(path: Path, arguments: argparse.Namespace, config: TrackingConfig) -> dict[str, Any]:
     """One sequence: a row of the table as plain values, printed unless JSON goes to the screen."""
-    folder = Folder(path)
+    folder = Folder(path, arguments.max_depth_m, arguments.depth_frames)
     indices = list(range(0, len(folder), arguments.stride))[: arguments.frames]
     row = run(folder, path.name, indices, config)
     variants = [] if arguments.alone else ablation(folder, indices, config)

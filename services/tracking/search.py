@@ -195,20 +195,33 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
     """How far an estimate near the prior is believed."""
     prior, config = job.request.prior, job.config.verification
     assert prior is not None
-    frames = 1 + prior.lost_frames
-    is_possible = is_possible_step(prior.T_world_camera, estimate.T_world_camera, frames, config)
-    if prior.lost_frames > config.brief_lost_frames:
-        is_believed = is_found(job.observed, estimate, job.config)
-    else:
-        is_believed = is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config))
-    if is_believed:
-        return TrackingStatus.TRACKED
+    is_possible = is_possible_step(
+        prior.T_world_camera, estimate.T_world_camera, 1 + prior.lost_frames, config
+    )
     if prior.lost_frames > 0:
-        return TrackingStatus.LOST
+        is_back = is_possible and _is_back(job, estimate, prior.lost_frames)
+        return TrackingStatus.TRACKED if is_back else TrackingStatus.LOST
+    if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
+        return TrackingStatus.TRACKED
     T_predicted = predict(prior, job.request.frame)
     if is_coarse(estimate, T_predicted, config) or (is_possible and is_only_seen(estimate, config)):
         return TrackingStatus.COARSE_ONLY
     return TrackingStatus.LOST
+
+
+def _is_back(job: Job, estimate: Estimate, lost_frames: int) -> bool:
+    """After a break: where most of what is seen is known, and after a long one beyond doubt.
+
+    A repeated object agrees as well as the right one, among surroundings that the map lacks.
+    """
+    config = job.config.verification
+    if lost_frames > config.brief_lost_frames:
+        return is_found(job.observed, estimate, job.config)
+    return (
+        is_confirmed(estimate, config)
+        and estimate.agreement.share >= config.sure_agreement
+        and estimate.registration.overlap >= config.explained_min_overlap
+    )
 
 
 def is_sure(estimate: Estimate, config: VerificationConfig) -> bool:
