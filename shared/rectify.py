@@ -34,9 +34,8 @@ class RgbdImage:
 
     def mean_colour(self) -> NDArray[np.floating]:
         """Mean of the colours that count, 0 to 255, [3]; zero where none does."""
-        if self.moving is None:
-            return self.rgb.reshape(-1, 3).mean(0)
-        return self.rgb[~self.moving].sum(0) / max(1, np.count_nonzero(~self.moving))
+        counted = None if self.moving is None else (~self.moving).astype(np.uint8)
+        return np.array(cv2.mean(self.rgb, counted)[:3])
 
 
 def rectify(frame: Frame, calibration: Calibration) -> RgbdImage:

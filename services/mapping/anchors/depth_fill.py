@@ -52,9 +52,17 @@ def _smoothest(values: NDArray[np.float32], is_known: NDArray[np.bool_]) -> NDAr
 def _halved(
     values: NDArray[np.float32], is_known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Means of the known pixels of 2x2 cells, and which cells have any."""
-    margin = (0, values.shape[0] % 2), (0, values.shape[1] % 2)
-    shape = (values.shape[0] + 1) // 2, 2, (values.shape[1] + 1) // 2, 2
-    sums = np.pad(values * is_known, margin).reshape(shape).sum(axis=(1, 3))
-    counts = np.pad(is_known, margin).reshape(shape).sum(axis=(1, 3))
-    return (sums / np.maximum(counts, 1)).astype(np.float32), counts > 0
+    """Means of the known pixels of 2x2 cells, and which cells have any; unknown ones are 0."""
+    odd = 0, values.shape[0] % 2, 0, values.shape[1] % 2
+    shares = is_known.astype(np.float32)
+    if any(odd):
+        values = _padded(values, odd)
+        shares = _padded(shares, odd)
+    size = values.shape[1] // 2, values.shape[0] // 2
+    shares = cv2.resize(shares, size, interpolation=cv2.INTER_AREA)
+    means = cv2.resize(values, size, interpolation=cv2.INTER_AREA) / np.maximum(shares, 0.25)
+    return means.astype(np.float32), shares > 0.0
+
+
+def _padded(values: NDArray[np.float32], odd: tuple[int, int, int, int]) -> NDArray[np.float32]:
+    return np.asarray(cv2.copyMakeBorder(values, *odd, cv2.BORDER_CONSTANT), np.float32)

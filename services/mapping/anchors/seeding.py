@@ -132,12 +132,13 @@ def _samples(request: SeedRequest, config: AnchorConfig, rng: np.random.Generato
     gain, bias = request.exposure
     landmarks = _LandmarkVoxels.of(request, config)
     is_candidate = request.is_uncovered | landmarks.pixels(camera)
-    pixels = rng.permutation(np.flatnonzero(image.depth_m > 0.0))
+    # Drawn for every pixel: a landmark has the same anchor whatever else the map explains.
+    draws = rng.random((3, image.depth_m.size), np.float32)
+    pixels = np.flatnonzero((image.depth_m > 0.0) & is_candidate)
+    pixels = pixels[np.argsort(draws[2, pixels])]
+    rows, columns = np.divmod(pixels, camera.width)
     # A sample stands for its whole pixel, whose centre is at the whole number.
-    jitter = rng.uniform(-0.5, 0.5, (2, len(pixels)))
-    kept = np.flatnonzero(is_candidate.ravel()[pixels])
-    rows, columns = np.divmod(pixels[kept], camera.width)
-    u, v = columns + jitter[0, kept], rows + jitter[1, kept]
+    u, v = columns + draws[0, pixels] - 0.5, rows + draws[1, pixels] - 0.5
     depths = image.depth_m[rows, columns]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1)
     points = transform(request.T_world_camera, rays * depths[:, None])

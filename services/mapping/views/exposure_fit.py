@@ -31,25 +31,28 @@ def fitted_exposure(
     Args:
         before: the exposure that it would have without, [2, 3].
     """
-    step = config.pixel_step
-    is_known = _is_known(look, config)[::step, ::step]
+    grid = np.s_[:: config.pixel_step, :: config.pixel_step]
+    is_known = _is_known(look, grid, config)
     if is_known.mean() < config.min_overlap:
         return None
-    alpha = look.rendered.alpha.detach().cpu().numpy()[::step, ::step, None]
-    drawn = look.rendered.colour.detach().cpu().numpy()[::step, ::step] / np.maximum(alpha, 0.5)
-    drawn, seen = drawn[is_known].astype(np.float64), look.rgb[::step, ::step][is_known]
+    alpha = look.rendered.alpha.detach().cpu().numpy()[grid][..., None]
+    drawn = look.rendered.colour.detach().cpu().numpy()[grid] / np.maximum(alpha, 0.5)
+    drawn, seen = drawn[is_known].astype(np.float64), look.rgb[grid][is_known]
     lines = [_line(drawn[:, c], seen[:, c], before[:, c], config) for c in range(3)]
     fitted = np.stack(lines, axis=1).astype(np.float32)
     least = (1.0 - config.min_improvement) * _cost(drawn, seen, before)
     return fitted if _cost(drawn, seen, fitted) < least else before
 
 
-def _is_known(look: FirstLook, config: ExposureConfig) -> NDArray[np.bool_]:
-    """Pixels whose surface both show, [H, W]."""
-    gap_m = np.abs(look.depth_drawn_m() - look.depth_m)
-    is_known = look.rendered.alpha.detach().cpu().numpy() > config.min_alpha
-    is_known &= (look.depth_m > 0) & (gap_m < 0.02 + 0.05 * look.depth_m)
-    return is_known & (look.rgb.max(axis=2) < 0.97) & (look.rgb.min(axis=2) > 0.02)
+def _is_known(
+    look: FirstLook, grid: tuple[slice, slice], config: ExposureConfig
+) -> NDArray[np.bool_]:
+    """Pixels of a grid whose surface both show."""
+    depth_m, rgb = look.depth_m[grid], look.rgb[grid]
+    gap_m = np.abs(look.depth_drawn_m()[grid] - depth_m)
+    is_known = look.rendered.alpha.detach().cpu().numpy()[grid] > config.min_alpha
+    is_known &= (depth_m > 0) & (gap_m < 0.02 + 0.05 * depth_m)
+    return is_known & (rgb.max(axis=2) < 0.97) & (rgb.min(axis=2) > 0.02)
 
 
 def _line(drawn: Array, seen: Array, before: NDArray[np.float32], config: ExposureConfig) -> Array:
