@@ -91,6 +91,8 @@ class Correction:
     T_world_keyframes: NDArray[np.float64]  # [K, 4, 4]
     landmark_ids: NDArray[np.int64]  # [L]
     positions_world: NDArray[np.float64]  # [L, 3]
+    # [D, 2], (keyframe seq, landmark id) of observations that turned out to be of something else
+    outliers: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
 
 @dataclass(frozen=True)

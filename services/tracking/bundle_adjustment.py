@@ -68,6 +68,19 @@ def solve_bundle(
     return BundleSolution(state.T_world_cameras, state.points_world, start, cost)
 
 
+def pixel_chi2(
+    problem: BundleProblem, solution: BundleSolution, intrinsics: Intrinsics
+) -> NDArray[np.float64]:
+    """Squared reprojection errors at a solution, in variances of their pixels, [O]."""
+    views = inverse(solution.T_world_cameras)[problem.camera_index]
+    points = solution.points_world[problem.point_index]
+    seen = np.einsum("oij,oj->oi", views[:, :3, :3], points) + views[:, :3, 3]
+    i, z = intrinsics, np.maximum(seen[:, 2:], 0.05)
+    pixels = seen[:, :2] / z * [i.fx, i.fy] + [i.cx, i.cy]
+    errors = (pixels - problem.measured[:, :2]) / problem.sigmas[:, :1]
+    return np.asarray(np.square(errors).sum(axis=1), np.float64)
+
+
 @dataclass(frozen=True)
 class _State:
     T_world_cameras: NDArray[np.float64]

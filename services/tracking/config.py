@@ -241,7 +241,7 @@ class BundleAdjustmentConfig:
     iterations: int = 8  # 0: keyframes stay where they were tracked
     pixel_sigma: float = 1.5
     huber_sigma: float = 2.0
-    outlier_chi2: float = 16.0
+    outlier_chi2: float = 6.0  # one in twenty of the right observations exceeds it
     depth_sigma_floor_m: float = 0.003
     depth_sigma_per_m2: float = 0.003
     pose_prior_share: float = 1.0  # weight of the geometry that holds a window's poses

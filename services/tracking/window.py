@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.tracking.bundle_adjustment import BundleProblem, solve_bundle
+from services.tracking.bundle_adjustment import BundleProblem, pixel_chi2, solve_bundle
 from services.tracking.config import TrackingConfig
 from services.tracking.orb import backproject
 from services.tracking.registration import Registration, optimum
@@ -63,8 +63,8 @@ def adjust_window(
     """Adjust the new keyframe with its window and place the landmarks that it found.
 
     Features without depth become landmarks where an earlier keyframe sees them too. The correction
-    has new poses of the window's free keyframes and of this one (last), new
-    positions of the adjusted landmarks and first positions of the new ones.
+    has new poses of the window's free keyframes and of this one (last), new positions of the
+    adjusted landmarks and first positions of the new ones.
     """
     window = (*context.window, _as_window(keyframe))
     observed = _observed(window, context.landmarks, config)
@@ -85,24 +85,42 @@ def adjust_window(
     poses = solution.T_world_cameras
     *adjusted, new = (replace(w, T_world_camera=T) for w, T in zip(window, poses, strict=True))
     placed = triangulate(new, tuple(adjusted), intrinsics, config.triangulation)
-    seen_again = (context.landmarks.ids[seen], solution.points_world)
-    own = _own_landmarks(new.seq, new.T_world_camera, new.observations, intrinsics)
-    correction = _correction(
-        [keyframe for keyframe in (*adjusted, new) if not keyframe.is_fixed],
-        [seen_again, own, (placed.landmark_ids, placed.positions_world)],
-    )
+    ids = context.landmarks.ids[seen]
+    landmarks = [
+        (ids, solution.points_world),
+        _own_landmarks(new.seq, new.T_world_camera, new.observations, intrinsics),
+        (placed.landmark_ids, placed.positions_world),
+    ]
+    is_outlier = pixel_chi2(problem, solution, intrinsics) > config.bundle_adjustment.outlier_chi2
+    outliers = _named(problem, is_outlier, window, ids)
+    correction = _correction((*adjusted, new), landmarks, outliers)
     return AdjustedKeyframe(placed.named(new.observations), correction)
+
+
+def _named(
+    problem: BundleProblem,
+    which: NDArray[np.bool_],
+    window: tuple[WindowKeyframe, ...],
+    ids: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Some observations as (keyframe seq, landmark id), [D, 2]."""
+    seqs = np.array([keyframe.seq for keyframe in window], np.int64)
+    return np.column_stack([seqs[problem.camera_index[which]], ids[problem.point_index[which]]])
 
 
 _Placed = tuple[NDArray[np.int64], NDArray[np.float64]]  # ids [L], positions in the world [L, 3]
 
 
-def _correction(moved: list[WindowKeyframe], placed: list[_Placed]) -> Correction:
+def _correction(
+    window: tuple[WindowKeyframe, ...], placed: list[_Placed], outliers: NDArray[np.int64]
+) -> Correction:
+    free = [keyframe for keyframe in window if not keyframe.is_fixed]
     return Correction(
-        keyframe_seqs=np.array([keyframe.seq for keyframe in moved], np.int64),
-        T_world_keyframes=np.stack([keyframe.T_world_camera for keyframe in moved]),
+        keyframe_seqs=np.array([keyframe.seq for keyframe in free], np.int64),
+        T_world_keyframes=np.stack([keyframe.T_world_camera for keyframe in free]),
         landmark_ids=np.concatenate([ids for ids, _ in placed]),
         positions_world=np.concatenate([positions for _, positions in placed]),
+        outliers=outliers,
     )
 
 

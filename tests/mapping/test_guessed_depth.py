@@ -125,6 +125,16 @@ def test_an_image_without_depth_has_that_of_its_landmarks(image):
     np.testing.assert_allclose(filled.depth_m, 4.0, rtol=1e-4)
 
 
+def test_a_landmark_far_from_those_around_it_is_taken_for_wrong(image):
+    empty = dataclasses.replace(image, depth_m=np.zeros_like(image.depth_m))
+    landmarks = points_at(4.0, np.arange(0, 160, 8))
+    landmarks[10] *= 0.3  # along its ray
+
+    filled = with_guesses(empty, np.eye(4), *seeing(4.0), AnchorConfig(), landmarks)
+
+    np.testing.assert_allclose(filled.depth_m, 4.0, rtol=1e-4)
+
+
 def test_readings_go_before_landmarks(image):
     landmarks = points_at(4.0, np.arange(5, 40))
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -81,6 +83,18 @@ def test_a_correction_moves_earlier_keyframes(store):
     np.testing.assert_array_equal(store.pose(0), exp([0.01] * 6))
     np.testing.assert_array_equal(store.pose(10), POSE)
     np.testing.assert_array_equal(store.poses().T_world_keyframes[0], exp([0.01] * 6))
+
+
+def test_observations_that_a_correction_refutes_are_forgotten(store):
+    new = landmark_id(20, np.arange(3))
+    outliers = np.array([(0, 4), (10, 4), (10, 6), (99, 5)], np.int64)  # 99: not here any more
+    refuting = dataclasses.replace(correction([20], POSE[None], new, 3.0), outliers=outliers)
+
+    store.insert(20, 1, POSE, keyframe(20, new, refuting))
+
+    assert 4 not in store.landmarks_seen_by(0)[0]
+    assert np.isin([4, 6], store.landmarks_seen_by(10)[0]).tolist() == [False, False]
+    assert np.isin([5, 6, 7], store.landmarks_seen_by(0)[0]).all()
 
 
 def test_a_correction_moves_and_adds_landmarks(store):

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from services.tracking.bundle_adjustment import BundleProblem, solve_bundle
+from services.tracking.bundle_adjustment import BundleProblem, pixel_chi2, solve_bundle
 from services.tracking.bundle_kernels import huber_cost, linearise
 from services.tracking.config import BundleAdjustmentConfig
 from shared.camera import Intrinsics
@@ -73,6 +73,19 @@ def test_noise_and_outliers_leave_two_millimetres():
 
     assert pose_errors_m(scene.problem.T_world_cameras, scene).max() > 0.01
     assert pose_errors_m(solution.T_world_cameras, scene).max() < 0.002
+
+
+def test_what_is_of_something_else_is_far_from_where_it_should_be():
+    scene = make_scene(pixel_noise=0.7, outliers=0.05)
+    problem = scene.problem
+    true = np.stack([project(pose, scene.true_points) for pose in scene.true_poses], axis=1)
+    is_wrong = np.abs(problem.measured - true.reshape(-1, 3))[:, :2].max(axis=1) > 5.0
+
+    chi2 = pixel_chi2(problem, solve_bundle(problem, CAMERA, CONFIG), CAMERA)
+
+    assert is_wrong.sum() > 50
+    assert (chi2[is_wrong] > CONFIG.outlier_chi2).all()
+    assert (chi2[~is_wrong] > CONFIG.outlier_chi2).mean() < 0.03
 
 
 def test_fixed_cameras_keep_their_bits():

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TriangulationConfig
 from services.tracking.keyframes import keyframe_observations
 from services.tracking.orb import extract_features
@@ -215,3 +216,25 @@ def test_a_camera_goes_on_where_its_depth_ends(room, session):
     assert {result.status for result in results[6:]} == {TrackingStatus.COARSE_ONLY}
     assert any(result.keyframe is not None for result in results[6:])
     assert errors_m(results, truth).max() < 0.04
+
+
+def test_a_wrong_observation_of_a_landmark_is_named_by_the_next_keyframe(room, session):
+    truth = [exp([0.03 * i, 0.0, 0.0, 0.0, 0.0, 0.0]) for i in range(30)]
+    results = iter(session.track(room.frame(i, T)) for i, T in enumerate(truth))
+    [next(r for r in results if r.keyframe is not None) for _ in range(2)]
+    second = session.store.context(-1).window[-1]
+    wrong = second.observations.landmark_ids[0]
+    shift_feature(session.store, second.seq, wrong)
+
+    correction = next(r for r in results if r.keyframe is not None).keyframe.correction
+
+    assert (second.seq, wrong) in [tuple(row) for row in correction.outliers.tolist()]
+
+
+def shift_feature(store: KeyframeStore, seq: int, landmark: int) -> None:
+    """As if a keyframe had taken something else for a landmark."""
+    keyframe = store._keyframes[seq]
+    pixels = keyframe.observations.keypoints_px.copy()
+    pixels[keyframe.observations.landmark_ids == landmark] += 40.0
+    moved = dataclasses.replace(keyframe.observations, keypoints_px=pixels)
+    store._keyframes[seq] = dataclasses.replace(keyframe, observations=moved)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.mapping.anchors.membership import is_among
 from services.mapping.keyframes.stored import LandmarkTable
 from shared.se3 import rotate, transform
-from shared.tracks import KEYPOINT_BITS, KeyframeData, Observations
+from shared.tracks import KEYPOINT_BITS, NO_LANDMARK, KeyframeData, Observations
 
 
 def corrected(
@@ -77,6 +77,13 @@ def renamed(observations: Observations, pairs: NDArray[np.int64]) -> Observation
     if not is_dropped.any():
         return observations
     return replace(observations, landmark_ids=np.where(is_dropped, pairs[at, 0], ids))
+
+
+def dropped(observations: Observations, ids: NDArray[np.int64]) -> Observations:
+    """Observations that are of none of the given landmarks."""
+    is_dropped = is_among(observations.landmark_ids, ids)
+    kept = np.where(is_dropped, np.int64(NO_LANDMARK), observations.landmark_ids)
+    return replace(observations, landmark_ids=kept)
 
 
 def one_to_one(pairs: NDArray[np.int64]) -> NDArray[np.int64]:

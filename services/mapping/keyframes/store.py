@@ -21,7 +21,7 @@ from services.mapping.keyframes.context import (
     empty_context,
     landmarks_seen,
 )
-from services.mapping.keyframes.landmarks import corrected, moved, renamed, without
+from services.mapping.keyframes.landmarks import corrected, dropped, moved, renamed, without
 from services.mapping.keyframes.loop_candidates import loop_candidates
 from services.mapping.keyframes.loop_closing import LoopCloser
 from services.mapping.keyframes.loop_config import LoopConfig
@@ -89,6 +89,7 @@ class KeyframeStore:
         self._move_keyframes(_by_seq(data.correction))
         normals_world = rotate(self.pose(seq), data.landmark_normals_camera)
         self._landmarks = corrected(self._landmarks, data, normals_world)
+        self._drop(data.correction.outliers)
         poses = self._poses()
         self._loops.graph.follow(data.correction.keyframe_seqs.tolist(), poses)
         self._loops.link(self._keyframes[seq], data.link, poses)
@@ -109,6 +110,14 @@ class KeyframeStore:
         for keyframe in list(self._keyframes.values()):
             observations = renamed(keyframe.observations, closing.landmark_ids)
             self._keyframes[keyframe.seq] = replace(keyframe, observations=observations)
+
+    def _drop(self, outliers: NDArray[np.int64]) -> None:
+        """Forget observations that the adjustment refuted."""
+        for seq in np.unique(outliers[:, 0]).tolist():
+            if seq in self._keyframes:
+                keyframe = self._keyframes[seq]
+                seen = dropped(keyframe.observations, outliers[outliers[:, 0] == seq, 1])
+                self._keyframes[seq] = replace(keyframe, observations=seen)
 
     def _move_keyframes(self, T_world_keyframes: Poses) -> None:
         for seq, T_world_camera in T_world_keyframes.items():

@@ -91,6 +91,7 @@ def _shapes_of_keyframe(data: KeyframeData) -> _Shaped:
         "correction.T_world_keyframes": (moved.T_world_keyframes, (poses, 4, 4)),
         "correction.landmark_ids": (moved.landmark_ids, (landmarks,)),
         "correction.positions_world": (moved.positions_world, (landmarks, 3)),
+        "correction.outliers": (moved.outliers, (moved.outliers.size // 2, 2)),
     }
 
 

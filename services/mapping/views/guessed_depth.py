@@ -12,6 +12,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from services.mapping.anchors.depth_fill import filled_depth
 from services.mapping.anchors.seeding import SeedRequest
@@ -22,6 +23,7 @@ from shared import se3
 
 _FURTHER = (1.0, 1.2, 1.5, 2.0)  # times the first guess; beyond the last, there is none
 _NEAREST_M = 0.1
+_AROUND = 7  # landmarks, the one in question among them
 _STEP_PX = 4  # of a row and column, between the pixels that are looked at
 _PROBE_STEP = 24  # of those, between the points that keyframes are chosen by
 
@@ -69,12 +71,19 @@ def _with_landmarks(request: SeedRequest) -> NDArray[np.float32]:
     points = points[points[:, 2] > _NEAREST_M]
     pixels = points[:, :2] / points[:, 2:] * [i.fx, i.fy] + [i.cx + 0.5, i.cy + 0.5]
     u, v = np.floor(pixels).astype(np.int64).T
-    inside = (u >= 0) & (v >= 0) & (u < i.width) & (v < i.height)
-    u, v, z = u[inside], v[inside], points[inside, 2]
-    is_empty = image.depth_m[v, u] == 0
+    inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < i.width) & (v < i.height))
+    kept = inside[image.depth_m[v[inside], u[inside]] == 0]
     depth_m = image.depth_m.copy()
-    depth_m[v[is_empty], u[is_empty]] = z[is_empty]
+    depth_m[v[kept], u[kept]] = _usual_depths(pixels[kept], points[kept, 2])
     return depth_m
+
+
+def _usual_depths(pixels: NDArray[np.float64], depths_m: NDArray[np.float64]) -> NDArray:
+    """The median of each landmark [L] and those around it: one in four may be of something else."""
+    if len(pixels) < _AROUND:
+        return depths_m
+    _, around = KDTree(pixels).query(pixels, _AROUND)
+    return np.median(depths_m[around], axis=1)
 
 
 def _spread(factors: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
