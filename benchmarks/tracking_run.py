@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -41,23 +41,19 @@ _SPAN = 100  # frames whose times are compared
 class Folder:
     """A sequence folder with calibration.json, associations.txt and groundtruth.txt.
 
-    Args:
-        path: the folder.
-        max_depth_m: as if the sensor did not see farther.
-        depth_frames: only the first so many have depth; None: all.
+    As of a sensor that sees no farther than `max_depth_m`, or fails after so many `depth_frames`.
     """
 
     def __init__(
-        self, path: Path, max_depth_m: float | None = None, depth_frames: int | None = None
+        self, path: Path, max_depth_m: float | None = None, depth_frames: float | None = None
     ) -> None:
         self._path = path
-        self._depth_frames = depth_frames
+        self._depth_frames = np.inf if depth_frames is None else depth_frames
         values = json.loads((path / "calibration.json").read_text())
         names = ("fx", "fy", "cx", "cy", "width", "height")
         camera = Camera(Intrinsics(*(values[name] for name in names)))
-        self.calibration = Calibration(camera, values["depth_scale"])
-        if max_depth_m is not None:
-            self.calibration = replace(self.calibration, max_depth_m=max_depth_m)
+        limits = {} if max_depth_m is None else {"max_depth_m": max_depth_m}
+        self.calibration = Calibration(camera, values["depth_scale"], **limits)
         self._rows = [line.split() for line in _lines(path / "associations.txt")]
         self._truth = np.loadtxt(path / "groundtruth.txt", ndmin=2)
 
@@ -67,20 +63,17 @@ class Folder:
     def frame(self, index: int) -> Frame:
         """One frame; every eighth is held out of the map, as an evaluation run does."""
         stamp, colour, _, depth = self._rows[index]
-        has_depth = self._depth_frames is None or index < self._depth_frames
         return Frame(
             seq=index,
             t_ns=round(float(stamp) * 1e9),
             rgb=ColourImage(ColourEncoding.JPEG, (self._path / colour).read_bytes()),
-            depth=self._depth(depth) if has_depth else self._black,
+            depth=self._depth(depth if index < self._depth_frames else None),
             may_be_keyframe=index % 8 != 4,
         )
 
-    def _depth(self, name: str) -> DepthImage:
-        return DepthImage(DepthEncoding.PNG16, (self._path / name).read_bytes())
-
-    @property
-    def _black(self) -> DepthImage:
+    def _depth(self, name: str | None) -> DepthImage:
+        if name is not None:
+            return DepthImage(DepthEncoding.PNG16, (self._path / name).read_bytes())
         size = self.calibration.colour.intrinsics
         return DepthImage(DepthEncoding.RAW16, bytes(2 * size.width * size.height))
 

@@ -221,7 +221,9 @@ def export_map(session: Session, folder: RunFolder) -> None:
     archive = folder.path / "map.tar"
     session.export("snapshot", archive)
     with tarfile.open(archive) as tar:
-        tar.extractall(folder.map, filter="data")
+        # Python 3.11.2, Debian 12's own, knows no filters; the archive is our own gateway's.
+        tar.extraction_filter = getattr(tarfile, "data_filter", lambda member, _: member)
+        tar.extractall(folder.map)
     archive.unlink()
     session.export("ply", folder.ply)
 
