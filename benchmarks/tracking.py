@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from benchmarks.tracking_run import Folder, Row, run
 from benchmarks.tracking_variants import PeerRow, ablation, peers
@@ -87,8 +88,12 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("sequences", nargs="*", type=Path)
     parser.add_argument("--frames", type=int, help="at most so many")
     parser.add_argument("--stride", type=int, default=1, help="use every so many")
-    parser.add_argument("--max-depth-m", type=float, help="of a sensor that does not see farther")
-    parser.add_argument("--depth-frames", type=int, help="only the first so many have depth")
+    parser.add_argument(
+        "--max-depth-m", type=float, default=20.0, help="of a sensor that does not see farther"
+    )
+    parser.add_argument(
+        "--depth-frames", type=float, default=np.inf, help="only the first so many have depth"
+    )
     parser.add_argument("--alone", action="store_true", help="without ablation and peers")
     parser.add_argument("--json", nargs="?", const="-", help="to a file, or instead of the table")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")

@@ -44,16 +44,13 @@ class Folder:
     As of a sensor that sees no farther than `max_depth_m`, or fails after so many `depth_frames`.
     """
 
-    def __init__(
-        self, path: Path, max_depth_m: float | None = None, depth_frames: float | None = None
-    ) -> None:
+    def __init__(self, path: Path, max_depth_m: float = 20.0, depth_frames: float = np.inf) -> None:
         self._path = path
-        self._depth_frames = np.inf if depth_frames is None else depth_frames
+        self._depth_frames = depth_frames
         values = json.loads((path / "calibration.json").read_text())
         names = ("fx", "fy", "cx", "cy", "width", "height")
         camera = Camera(Intrinsics(*(values[name] for name in names)))
-        limits = {} if max_depth_m is None else {"max_depth_m": max_depth_m}
-        self.calibration = Calibration(camera, values["depth_scale"], **limits)
+        self.calibration = Calibration(camera, values["depth_scale"], max_depth_m=max_depth_m)
         self._rows = [line.split() for line in _lines(path / "associations.txt")]
         self._truth = np.loadtxt(path / "groundtruth.txt", ndmin=2)
 
