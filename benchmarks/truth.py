@@ -2,7 +2,8 @@
 
 Each pair is registered twice, from the truth's motion and from the tracker's. Where both starts end
 at the same motion, what is left between it and a trajectory is that trajectory's error (and the
-depth's). The residual says how far apart the two surfaces are under each motion.
+depth's). The residual says how far apart the two surfaces are under each motion, in millimetres,
+and how far apart the two images are where both show the same surface, in grey levels of 255.
 
 python -m benchmarks.truth SEQUENCE... [--gap 30] [--step 1]
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,7 @@ from services.tracking.config import RegistrationConfig, SurfaceConfig, Tracking
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.registration import align, linearise
 from services.tracking.voxel_map import VoxelMap, build_voxel_map
-from shared.rectify import rectify
+from shared.rectify import RgbdImage, rectify
 from shared.se3 import angle_rad, inverse
 from shared.tracks import PointCloud
 
@@ -35,6 +36,7 @@ _REGISTRATION = RegistrationConfig(
     tolerances=(5e-4, 2e-4, 2e-5),
 )
 _MIN_OVERLAP = 0.5
+_SAME_SURFACE = 0.05  # of the depth, and 2 cm: the other image shows it too
 Motions = list[NDArray[np.float64]]
 
 
@@ -48,6 +50,7 @@ class Pair:
     from_tracked: NDArray[np.float64]
     residuals_mm: tuple[float, float, float, float]  # in the order above
     overlap: float
+    grey: tuple[float, float] = (0.0, 0.0)  # under the first two
 
 
 def measure(folder: Folder, gap: int, step: int) -> list[Pair]:
@@ -59,17 +62,44 @@ def measure(folder: Folder, gap: int, step: int) -> list[Pair]:
     truth = np.stack([folder.true_pose(index) for index in indices])
     pairs: list[Pair] = []
     for i in range(0, len(indices) - gap, step):
-        earlier, later = _surface(folder, i), _surface(folder, i + gap)
+        image, moved = (rectify(folder.frame(j), folder.calibration) for j in (i, i + gap))
+        earlier, later = _surface(image), _surface(moved)
         true, ours = (inverse(p[i]) @ p[i + gap] for p in (truth, poses))
         pair = register_pair(earlier, later, true, ours)
         if pair.overlap >= _MIN_OVERLAP:
-            pairs.append(pair)
+            grey = grey_residual(image, moved, true), grey_residual(image, moved, ours)
+            pairs.append(replace(pair, grey=grey))
     return pairs
 
 
-def _surface(folder: Folder, index: int) -> PointCloud:
-    image = rectify(folder.frame(index), folder.calibration)
+def _surface(image: RgbdImage) -> PointCloud:
     return surface_from_depth(image.depth_m, image.intrinsics, _SURFACE)
+
+
+def grey_residual(earlier: RgbdImage, later: RgbdImage, T: NDArray[np.float64]) -> float:
+    """Root mean square between the images, of the surface that both show under a motion.
+
+    Args:
+        T: T_earlier_later, [4, 4].
+    """
+    camera, depth_m = later.intrinsics, later.depth_m
+    v, u = np.indices(depth_m.shape)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], 2)
+    x, y, z = np.moveaxis(rays * depth_m[..., None] @ T[:3, :3].T + T[:3, 3], -1, 0)
+    z = np.maximum(z, 1e-3)
+    map_u = (x / z * camera.fx + camera.cx).astype(np.float32)
+    map_v = (y / z * camera.fy + camera.cy).astype(np.float32)
+    there_m = cv2.remap(earlier.depth_m, map_u, map_v, cv2.INTER_NEAREST)
+    is_same = (depth_m > 0) & (there_m > 0)
+    is_same &= np.abs(there_m - z) < _SAME_SURFACE * z + 0.02
+    grey_there = cv2.remap(_grey(earlier), map_u, map_v, cv2.INTER_LINEAR)[is_same]
+    grey_here = _grey(later)[is_same]
+    gain, bias = np.polyfit(grey_there, grey_here, 1)  # exposure is not the motion's
+    return float(np.sqrt(np.mean((gain * grey_there + bias - grey_here) ** 2)))
+
+
+def _grey(image: RgbdImage) -> NDArray[np.float32]:
+    return cv2.cvtColor(image.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
 def register_pair(
@@ -110,6 +140,8 @@ def _print(name: str, pairs: list[Pair]) -> None:
     print(f"  tracker to what is registered from it     {_difference(ours, from_ours)}")
     print(f"  tracker to what is registered from truth  {_difference(ours, from_true)}")
     print(f"  residual mm: truth {a:.2f}, tracker {b:.2f}, registered {c:.2f} and {d:.2f}")
+    true_grey, our_grey = np.median([p.grey for p in pairs], axis=0)
+    print(f"  grey levels: truth {true_grey:.1f}, tracker {our_grey:.1f}")
 
 
 def main(argv: list[str]) -> int:

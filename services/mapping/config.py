@@ -87,6 +87,7 @@ class LearningRates:
     covariance_network: float = 4e-3
     exposure_gain: float = 5e-3
     exposure_bias: float = 2e-3
+    poses: float = 0.0  # share of the Gauss-Newton step that aligns a keyframe with the map
 
     def scaled(self, factor: float) -> LearningRates:
         """All rates times a factor."""
@@ -98,7 +99,7 @@ class RefinementConfig:
     """Steps of Adam in a refinement: wide at first, as there is time to settle."""
 
     rates: LearningRates = LearningRates(
-        features=0.04, offsets=0.05, scalings=0.05, opacity_network=8e-3
+        features=0.04, offsets=0.05, scalings=0.05, opacity_network=8e-3, poses=0.3
     )
     decay: float = 0.2  # of all rates, at the end
 

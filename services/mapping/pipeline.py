@@ -7,7 +7,6 @@ thread may ask for renders.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -29,6 +28,7 @@ from services.mapping.losses.cpu import mapping_loss_cpu
 from services.mapping.losses.mapping_loss import Appearance, Target, mapping_loss
 from services.mapping.map_state import MapState, as_arrays, as_tensors, flatten, unflatten
 from services.mapping.rasterizer import View, rasterizer_for
+from services.mapping.views.alignment import aligning_twist
 from services.mapping.views.appearance import ExposureModel
 from services.mapping.views.colour_fusion import fuse_colours
 from services.mapping.views.coverage import uncovered_pixels
@@ -37,6 +37,7 @@ from services.mapping.views.first_look import first_look, resized
 from services.mapping.views.guessed_depth import with_guesses
 from services.mapping.views.render import Drawn, Painter, to_images
 from services.mapping.views.render_cache import Moment
+from services.mapping.views.running_psnr import RunningPsnr
 from services.mapping.views.sightings import Sightings
 from services.mapping.views.training_views import MovingCells, TrainingView, TrainingViews
 from shared import se3
@@ -46,8 +47,6 @@ from shared.maps import RenderReply, RenderRequest
 from shared.rectify import RgbdImage
 from shared.telemetry import StageTimes
 from shared.tracks import KeyframePoses
-
-_PSNR_WINDOW = 50  # training views in the running mean
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Mapper:
         self.iterations = 0
         self.revision = 0
         self.stages = StageTimes()
-        self._squared_errors: deque[float] = deque(maxlen=_PSNR_WINDOW)
+        self._psnr = RunningPsnr()
 
     @property
     def moment(self) -> Moment:
@@ -105,10 +104,7 @@ class Mapper:
     @property
     def psnr_db(self) -> float | None:
         """Mean PSNR of the last training views, None before the first."""
-        if not self._squared_errors:
-            return None
-        errors = np.maximum(np.array(self._squared_errors), 1e-10)
-        return float(np.mean(-10.0 * np.log10(errors)))
+        return self._psnr.mean_db
 
     def insert_keyframe(self, keyframe: NewKeyframe) -> int:
         """Seed the map where a new keyframe shows what the map lacks; returns new anchors.
@@ -179,7 +175,7 @@ class Mapper:
                 {
                     "background": self._background,
                     **self._placement.state(),
-                    "squared_errors": np.array(self._squared_errors, np.float64),
+                    "squared_errors": self._psnr.state(),
                 }
             ),
         }
@@ -201,7 +197,7 @@ class Mapper:
         mapper = as_arrays(groups["mapper"])
         self._background = mapper["background"].copy()
         self._placement.restore(mapper)
-        self._squared_errors.extend(mapper["squared_errors"].tolist())
+        self._psnr.restore(mapper["squared_errors"])
         self.iterations = state.values["iterations"]
         self.revision = state.values["revision"]
         self._rng.bit_generator.state = state.values["generator"]
@@ -228,7 +224,10 @@ class Mapper:
                 assert exposure.grad is not None
                 self.exposures.step(keyframe.seq, exposure.grad.cpu().numpy(), rates)
                 self._densify(drawn, progress)
-        self._squared_errors.append(float(loss.squared_error))
+            if rates.poses > 0:
+                twist = aligning_twist(drawn.rendered, target, appearance)
+                self.views.align(keyframe.seq, twist, rates.poses)
+        self._psnr.add(float(loss.squared_error))
 
     def _draw(self, view: View) -> Drawn:
         with self.stages.stage("decode"):

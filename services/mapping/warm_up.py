@@ -33,4 +33,5 @@ def warm_up() -> None:
     mapper = Mapper(calibration, MappingConfig(), 0, torch.device("cpu"))
     mapper.insert_keyframe(NewKeyframe(frame, poses, np.zeros((0, 3))))
     mapper.iterate()
+    mapper.refine(0.0)
     mapper.render(RenderRequest(np.eye(4), size))

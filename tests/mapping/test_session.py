@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from services.mapping.config import MappingConfig, OwnerConfig
-from services.mapping.sessions.session import Session, Surroundings
+from services.mapping.sessions.session import Session
+from services.mapping.sessions.surroundings import Surroundings
 from services.mapping.storage.folders import SessionFolder, SessionRecord, read_record
 from services.mapping.storage.tenure import Lease
 from shared import codec, se3
@@ -227,9 +228,23 @@ def test_final_poses_follow_their_keyframe(open_session, entry, true_pose):
     new = replace(old, keyframe_seqs=np.array([0, 4]), T_world_keyframes=poses)
     session.advance(replace(correction, keyframe=replace(correction.keyframe, correction=new)))
 
-    final = session.ledger.trajectory().T_world_cameras_final
+    final = session.trajectory().T_world_cameras_final
 
     np.testing.assert_allclose(final[1][:3, 3] - true_pose(1)[:3, 3], [0.1, 0, 0], atol=1e-9)
+
+
+def test_final_poses_are_where_a_refinement_put_their_keyframe(open_session, entry):
+    session = open_session()
+    for seq in (0, 4, 5):  # 5 is no keyframe
+        session.advance(entry(seq))
+    before = session.trajectory().T_world_cameras_final
+    refined(session, 20)
+
+    after = session.trajectory().T_world_cameras_final
+
+    T_new_old = after[1] @ se3.inverse(before[1])
+    assert np.abs(T_new_old - np.eye(4)).max() > 0
+    np.testing.assert_allclose(after[2], T_new_old @ before[2], atol=1e-12)
 
 
 def test_a_refinement_runs_to_its_end_and_says_so(open_session, entry):

@@ -8,7 +8,7 @@ from benchmarks.cold_worker import cold_worker
 from benchmarks.peers.opencv_odometry import OpencvOdometry
 from benchmarks.peers.registry import PEERS, PeerEntry
 from benchmarks.tracking_run import absolute_error
-from benchmarks.truth import register_pair
+from benchmarks.truth import grey_residual, register_pair
 from services.tracking.config import SurfaceConfig, TrackingConfig
 from services.tracking.point_cloud import surface_from_depth
 from shared.config import override, read_overrides
@@ -95,3 +95,9 @@ def test_a_truth_that_is_off_is_told_from_a_pose_that_is_right(room):
     np.testing.assert_allclose(pair.from_true, T, atol=1e-3)
     np.testing.assert_allclose(pair.from_tracked, T, atol=1e-3)
     assert pair.residuals_mm[0] > 3.0 * max(pair.residuals_mm[1:])
+
+
+def test_two_images_agree_under_their_true_motion_and_under_no_other(room):
+    earlier, later = (room.view(CORNER @ step(i)) for i in (0, 3))
+
+    assert grey_residual(earlier, later, step(3)) < 0.5 * grey_residual(earlier, later, step(0))

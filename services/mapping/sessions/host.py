@@ -15,7 +15,8 @@ from services.mapping.config import MappingConfig
 from services.mapping.priority import give_way
 from services.mapping.sessions.opening import check_same, new_record
 from services.mapping.sessions.served import Served, answers, withdraw
-from services.mapping.sessions.session import Session, Surroundings
+from services.mapping.sessions.session import Session
+from services.mapping.sessions.surroundings import Surroundings
 from services.mapping.storage.folders import (
     SessionFolder,
     check_session_name,

@@ -19,6 +19,7 @@ from services.mapping.storage.folders import SessionFolder, SessionRecord
 from services.mapping.storage.frame_records import FrameRecords
 from services.mapping.storage.log import SessionLog, read_log
 from services.mapping.storage.snapshot import read_newest
+from services.mapping.views.pose_offsets import Offsets
 from shared.errors import ConflictError
 from shared.frames import Frame, Prior
 from shared.maps import JobStatus, Trajectory
@@ -204,12 +205,13 @@ class Ledger:
         with self._lock:
             return self._store.candidates(request)
 
-    def trajectory(self) -> Trajectory:
-        """All answered frames, with the corrections of their keyframes applied."""
+    def trajectory(self, offsets: Offsets) -> Trajectory:
+        """All answered frames, with the corrections and offsets of their keyframes applied."""
         with self._lock:
             records = self._records.all()
             poses = self._store.poses()
         T_world_keyframe = dict(zip(poses.seqs.tolist(), poses.T_world_keyframes, strict=True))
+        T_world_keyframe |= {seq: T_world_keyframe[seq] @ T for seq, T in offsets.items()}
         final = [_final_pose(record, T_world_keyframe) for record in records]
         return Trajectory(records, np.array(final).reshape(-1, 4, 4), poses.seqs)
 

@@ -57,7 +57,7 @@ def answers(session: Session) -> list[tuple[str, type, Callable[[Any], object]]]
         ("interrupt", Empty, lambda _: session.interrupt()),
         ("save", SaveRequest, lambda _: session.save()),
         ("info", Empty, lambda _: session.info()),
-        ("trajectory", TrajectoryRequest, lambda _: ledger.trajectory()),
+        ("trajectory", TrajectoryRequest, lambda _: session.trajectory()),
     ]
 
 

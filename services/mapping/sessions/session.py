@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
-import torch
 
-from services.mapping.config import MappingConfig
 from services.mapping.export.map_files import write_map
 from services.mapping.export.pieces import Exports
 from services.mapping.export.spooled import pack_folder, spooled
@@ -22,6 +18,7 @@ from services.mapping.sessions.keyframe_images import KeyframeImages
 from services.mapping.sessions.ledger import Ledger, Resumed
 from services.mapping.sessions.opening import opening_of
 from services.mapping.sessions.renders import Renders
+from services.mapping.sessions.surroundings import Surroundings
 from services.mapping.sessions.worker import MapWorker
 from services.mapping.storage.claims import Claims
 from services.mapping.storage.folders import SessionFolder
@@ -40,6 +37,7 @@ from shared.maps import (
     RenderReply,
     RenderRequest,
     SaveReply,
+    Trajectory,
 )
 from shared.tracing import log_fields
 from shared.tracks import (
@@ -49,21 +47,10 @@ from shared.tracks import (
     ClaimReply,
     ClaimRequest,
     FrameRecord,
-    KeyframePoses,
     OpenReply,
 )
 
 LOGGER = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What a session needs of the process it runs in."""
-
-    mapper: str  # the process's name
-    config: MappingConfig
-    device: torch.device
-    publish: Callable[[str, KeyframePoses | Advanced], None]  # key, news
 
 
 class Session:
@@ -175,6 +162,10 @@ class Session:
         if request.T_world_camera.shape != (4, 4) or not np.isfinite(request.T_world_camera).all():
             raise InputError("T_world_camera", "must be 4x4 finite numbers")
         return self._renders.answer(request)
+
+    def trajectory(self) -> Trajectory:
+        """All answered frames; final poses go with their keyframes, as the map has them."""
+        return self.ledger.trajectory(self._worker.visit(lambda mapper: mapper.views.offsets.all()))
 
     def export(self, request: ExportRequest) -> ExportChunk:
         """A piece of the map as a file; see `ExportRequest`.

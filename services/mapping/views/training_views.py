@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from services.mapping.config import ScheduleConfig
 from services.mapping.losses.mapping_loss import Target
 from services.mapping.views.overlap import overlapping
+from services.mapping.views.pose_offsets import PoseOffsets
+from shared import se3
 from shared.camera import Calibration
 from shared.frames import Frame
 from shared.pixel_cells import pixels_of
@@ -72,6 +74,7 @@ class TrainingViews:
         self._config = config
         self._make_target = make_target
         self._views: dict[int, TrainingView] = {}
+        self.offsets = PoseOffsets()
         self._overlapping: list[int] = []  # seqs that overlap the newest one's view
         self._order: list[int] = []  # seqs left in this round of a refinement
         self._is_newest_drawn = True
@@ -114,8 +117,17 @@ class TrainingViews:
         return image
 
     def set_pose(self, seq: int, T_world_camera: NDArray[np.float64]) -> None:
-        """Replace a keyframe's pose."""
-        self._views[seq] = replace(self._views[seq], T_world_camera=T_world_camera)
+        """Replace a keyframe's pose by another one of tracking's; its offset stays."""
+        pose = T_world_camera @ self.offsets.of(seq)
+        self._views[seq] = replace(self._views[seq], T_world_camera=pose)
+
+    def align(self, seq: int, twist: NDArray[np.float64], rate: float) -> None:
+        """Move a keyframe, not the first one, off tracking's pose: see `PoseOffsets.move`."""
+        if seq == next(iter(self._views)):
+            return
+        T_world_camera = self._views[seq].T_world_camera @ se3.inverse(self.offsets.of(seq))
+        self.offsets.move(seq, twist, rate)
+        self.set_pose(seq, T_world_camera)
 
     def draw(self) -> TrainingView:
         """The newest keyframe once, then in a share of draws, else any one.
@@ -152,6 +164,7 @@ class TrainingViews:
         return {
             "seqs": self.seqs(),
             "poses": [view.T_world_camera.tolist() for view in self._views.values()],
+            "offsets": self.offsets.state(),
             "order": list(self._order),
             "overlapping": list(self._overlapping),
             "is_newest_drawn": self._is_newest_drawn,
@@ -164,6 +177,7 @@ class TrainingViews:
             seq: TrainingView(seq, frames[seq].t_ns, frames[seq], np.array(pose), moving.get(seq))
             for seq, pose in zip(state["seqs"], state["poses"], strict=True)
         }
+        self.offsets.restore(state.get("offsets", []))  # older snapshots have none
         self._order = list(state["order"])
         self._overlapping = list(state["overlapping"])
         self._is_newest_drawn = state.get("is_newest_drawn", True)  # not in older snapshots
