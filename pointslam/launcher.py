@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pointslam.process import Command, ServiceProcess
 from pointslam.settings import ServiceSettings
+from shared.addresses import host_port
 from shared.errors import ConfigError
 
 START_TIMEOUT_S = 300.0  # the first start compiles every kernel
@@ -46,7 +47,7 @@ class Access:
         """Where the gateway is found from this machine."""
         scheme = "http" if self.tls_certificate is None else "https"
         host = _HOST if self.host in ("0.0.0.0", "::") else self.host
-        return f"{scheme}://{host}:{port}"
+        return f"{scheme}://{host_port(host, port)}"
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from services.gateway.app import create_app, open_sessions
 from services.gateway.config import GatewayConfig
 from services.gateway.grpc_server import GrpcDoor, serve_grpc
 from services.gateway.sessions import Sessions
+from shared.addresses import host_port
 from shared.bus import Bus, open_bus
 from shared.errors import UnavailableError
 from shared.service import (
@@ -62,18 +63,27 @@ def main(argv: list[str]) -> None:
     config = settings_from(arguments, GatewayConfig())
     authority, tls = authority_from(arguments, config.access), tls_from(arguments)
     door = GrpcDoor(arguments.http_host, arguments.grpc_port, authority, tls)
-    listener = _listen(arguments.http_host, arguments.http_port, config.stream.unread_s)
+    listener = listen(arguments.http_host, arguments.http_port, config.stream.unread_s)
     with listener, open_bus(endpoints(arguments), config.bus) as bus:
         loop_factory = uvicorn.Config(lambda: None).get_loop_factory()
         with asyncio.Runner(loop_factory=loop_factory) as runner:
             runner.run(_serve(bus, config, listener, door, arguments.id))
 
 
-def _listen(host: str, port: int, unread_s: float) -> socket.socket:
+def listen(host: str, port: int, unread_s: float) -> socket.socket:
+    """A socket that connections come to, whose dead ones end after `unread_s`.
+
+    Raises:
+        UnavailableError: it cannot be listened on.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    is_both = host == "::" and socket.has_dualstack_ipv6()  # as gRPC does
     try:
-        listener = socket.create_server((host, port), backlog=512)
+        listener = socket.create_server(
+            (host, port), family=family, backlog=512, dualstack_ipv6=is_both
+        )
     except OSError as error:
-        raise UnavailableError(f"cannot listen on {host}:{port}: {error}") from None
+        raise UnavailableError(f"cannot listen on {host_port(host, port)}: {error}") from None
     # Connections inherit it.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1e3 * unread_s))
     return listener

@@ -22,6 +22,7 @@ from services.gateway.grpc_services import (
 )
 from services.gateway.grpc_tracking import TrackingService
 from services.gateway.sessions import Sessions
+from shared.addresses import host_port
 from shared.errors import UnavailableError
 from shared.wire import (
     map_service_pb2,
@@ -61,7 +62,7 @@ class GrpcDoor:
         Raises:
             UnavailableError: it cannot be listened on.
         """
-        address = f"{self.host}:{self.port}"
+        address = host_port(self.host, self.port)
         try:
             if self.tls is None:
                 server.add_insecure_port(address)

@@ -30,3 +30,16 @@ def test_everybody_is_let_in_only_where_nobody_could_show_a_key_or_a_token(acces
     settings = read_settings(None, words).services
 
     assert access.arguments(settings) == expected
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:80"),
+        ("::1", "http://[::1]:80"),
+        ("0.0.0.0", "http://127.0.0.1:80"),
+        ("::", "http://127.0.0.1:80"),
+    ],
+)
+def test_a_gateway_is_found_at_an_address_of_this_machine(host, expected):
+    assert Access(host).url(80) == expected
