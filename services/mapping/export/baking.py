@@ -27,7 +27,7 @@ MIN_OPACITY = 1.0 / 255.0
 _RIDGE = 0.01  # of `LeastSquares`
 _MAX_SIGHTS = 24  # of one anchor that are fitted to
 _MIN_WEIGHT = 1e-3  # a sight whose depth does not agree still says something where none does
-_BLOCK = 1 << 14  # anchors at once; bounds the memory of their normal equations
+_BLOCK = 1 << 12  # anchors at once; bounds the memory of their normal equations
 
 
 @dataclass(frozen=True)
