@@ -137,13 +137,14 @@ class Sessions:
             NotFoundError: there is no such session.
         """
         name = full_name(name)
-        session = self._open.get(name)
-        mapper = session.owner.mapper if session else await self._mapper_of(name)
-        if mapper is None:
-            raise NotFoundError(f"no session {public_name(name)!r}")
-        await self._delete_at(mapper, name)
-        if self._open.pop(name, None) is not None and session is not None:
-            session.close()
+        async with self._lock_of(name):  # who is about to open it is not left with a ghost
+            session = self._open.get(name)
+            mapper = session.owner.mapper if session else await self._mapper_of(name)
+            if mapper is None:
+                raise NotFoundError(f"no session {public_name(name)!r}")
+            await self._delete_at(mapper, name)
+            if session is not None and self._open.pop(name, None) is session:
+                session.close()
 
     async def _delete_at(self, mapper: str, name: str) -> None:
         """Ask until somebody has answered: a mapper that was gone before may have done it."""

@@ -79,3 +79,27 @@ def test_sessions_of_clients_that_vanished_are_not_kept_alive(bus, calibration, 
     alive = asyncio.run(alive_after_waves(bus, calibration, messages))
 
     assert alive == 0
+
+
+async def alive_after_a_race(bus, calibration):
+    """What is left of sessions that one gateway deletes while it takes them up again."""
+    CALLER.set(Caller("test"))
+    makers, takers = (open_sessions(bus, GatewayConfig()) for _ in range(2))
+    while not (makers.is_ready() and takers.is_ready()):
+        await asyncio.sleep(0.01)
+    left = []
+    for _ in range(CLIENTS):
+        name = (await makers.create(CreateRequest(calibration))).name
+        taking = asyncio.create_task(takers.get(name))
+        await asyncio.sleep(0)  # it has begun
+        await takers.delete(name)
+        left.append(weakref.ref(await taking))
+        del taking
+    deadline = time.monotonic() + PATIENCE_S
+    while (alive := count_alive(left)) and time.monotonic() < deadline:
+        await asyncio.sleep(0.05)
+    return alive
+
+
+def test_a_session_that_is_deleted_while_it_is_opened_is_not_kept_alive(bus, calibration):
+    assert asyncio.run(alive_after_a_race(bus, calibration)) == 0
