@@ -1,5 +1,6 @@
 """A mapper with its fill of sessions: whose place is free for one more."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
@@ -66,3 +67,20 @@ def test_a_mapper_that_is_ending_opens_nothing(bus, tmp_path, calibration):
 
         with pytest.raises(UnavailableError, match="is ending"):
             host.open(OpenRequest("first", "offline"))
+
+
+def test_the_list_does_not_wait_for_a_session_that_is_opened_or_saved(bus, tmp_path, calibration):
+    with (
+        full_mapper(bus, tmp_path, calibration, yield_idle_s=0.0) as host,
+        ThreadPoolExecutor(1) as another,
+        host._lock,  # as while a large session is read from disk
+    ):
+        assert another.submit(open_sessions, host).result(timeout=60.0) == {"first", "second"}
+
+
+def test_a_session_that_is_just_being_deleted_does_not_hide_the_others(bus, tmp_path, calibration):
+    with full_mapper(bus, tmp_path, calibration, yield_idle_s=0.0) as host:
+        (tmp_path / "second" / "session.msgpack").unlink()
+        (tmp_path / "second" / "session.msgpack").mkdir()  # named, but not to be read
+
+        assert open_sessions(host) == {"first"}

@@ -116,17 +116,15 @@ class MapperHost:
             return self._served[request.session].session.opening()
 
     def list(self) -> SessionList:
-        """All sessions on this mapper's disk that can be read."""
-        with self._lock, storage_errors(str(self._settings.data)):
+        """All sessions on this mapper's disk that can be read; waits for none that is opened."""
+        with storage_errors(str(self._settings.data)):
             folders = sorted(p for p in self._settings.data.iterdir() if has_session(p))
-            summaries = [self._summary(folder) for folder in folders]
+        summaries = [self._summary(folder) for folder in folders]
         return SessionList(tuple(s for s in summaries if s is not None))
 
     def infos(self) -> list[MapInfo]:
         """The state of every open session's map."""
-        with self._lock:
-            served = list(self._served.values())
-        return [each.session.info() for each in served]
+        return [each.session.info() for each in list(self._served.values())]
 
     def delete(self, request: DeleteRequest) -> Empty:
         """Close a session and remove every byte of it.
@@ -281,13 +279,14 @@ class MapperHost:
         LOGGER.info("%s: idle, put away to make room", session)
 
     def _summary(self, folder: Path) -> SessionSummary | None:
-        """None for a damaged session: it must not hide the others."""
+        """None for a damaged session, or one that is just deleted: it must not hide the others."""
         served = self._served.get(folder.name)
         try:
-            record = read_record(folder)
-            logs = sorted(folder.glob("log-*.bin"))
-            keyframes = sum(count_keyframes(p, record.log_ends.get(p.name)) for p in logs)
-        except StorageError as error:
+            with storage_errors(str(folder)):
+                record = read_record(folder)
+                logs = sorted(folder.glob("log-*.bin"))
+                keyframes = sum(count_keyframes(p, record.log_ends.get(p.name)) for p in logs)
+        except (NotFoundError, StorageError) as error:
             LOGGER.warning("not listed: %s", error)
             return None
         return SessionSummary(
