@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -25,3 +26,19 @@ class NoHelper(Executor):
 def taken_over(future: Future[T], work: Callable[[], T]) -> T:
     """The result of a task; done here where its thread has not come to it yet."""
     return work() if future.cancel() else future.result()
+
+
+class Once(Generic[T]):
+    """Work for the thread that first asks for its result; others that ask meanwhile wait."""
+
+    def __init__(self, work: Callable[[], T]) -> None:
+        self._work = work
+        self._lock = threading.Lock()
+        self._results: list[T] = []
+
+    def result(self) -> T:
+        """What the work gave; an error is raised to everyone who asks."""
+        with self._lock:
+            if not self._results:
+                self._results.append(self._work())
+            return self._results[0]

@@ -1,8 +1,8 @@
 """What one frame shows: its surface on the caller's thread, its features on a helper's meanwhile.
 
 Decoding colour and finding features needs no depth, registering needs nothing else, so the two run
-side by side and meet where features are first asked for. Where there is no helper they run one
-after the other, with the same result to the bit.
+side by side and meet where features are first asked for; whoever waits there finds a share of them.
+Where there is no helper all runs one after the other, with the same result to the bit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.orb import Features, Keypoints, detect, no_features, with_depth
+from services.tracking.detection import Detected, Detection, Keypoints, detect
+from services.tracking.executors import NoHelper, Once
+from services.tracking.orb import Features, no_features, with_depth
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.stopwatch import Stopwatch
 from shared.camera import Calibration, Intrinsics
@@ -49,6 +51,7 @@ class Observed:
     intrinsics: Intrinsics  # of both images
     cloud: PointCloud  # camera frame
     appearance: Future[Appearance]
+    finest: Once[Detected]  # keypoints of the finest octave, for whoever has to wait
     config: TrackingConfig
     moving: Features = field(default_factory=no_features)  # of what moves, left out above
     is_moving: NDArray[np.bool_] | None = None  # [H, W], its pixels; None: nothing moves
@@ -87,25 +90,26 @@ class Observed:
         pixels = np.rint(self.features.keypoints_px).astype(np.int64)
         u, v = pixels.clip(0, [i.width - 1, i.height - 1]).T
         on_it = np.flatnonzero(moving[v, u] & (self.features.depths_m > 0.0))
-        appearance: Future[Appearance] = Future()
         rgb = self.appearance.result().rgb
-        appearance.set_result(Appearance(rgb, detect(rgb, self.config.orb, ~is_moving)))
+        found = Appearance(rgb, detect(rgb, self.config.orb, ~is_moving))
         return Observed(
             depth_m=np.where(moving, np.float32(0.0), self.depth_m),
             intrinsics=i,
             cloud=PointCloud(points[stays], self.cloud.normals[stays]),
-            appearance=appearance,
+            appearance=NoHelper().submit(lambda: found),
+            finest=self.finest,
             config=self.config,
             moving=self.moving.joined(self.features.rows(on_it)),
             is_moving=is_moving,
         )
 
     def wait(self) -> None:
-        """Until the features are found.
+        """Until the features are found; those of the finest octave here, unless they are by now.
 
         Raises:
             InputError: the colour image cannot be decoded.
         """
+        self.finest.result()
         self.appearance.result()
 
 
@@ -119,19 +123,25 @@ def observe(
     """
     calibration = images.calibration
 
-    def look() -> Appearance:
+    def decode() -> tuple[NDArray[np.uint8], Detection]:
         with clock.stage("decode_colour"):
             rgb = rectify_colour(images.rgb, calibration)
-        with clock.stage("orb"):
-            return Appearance(rgb, detect(rgb, config.orb))
+            return rgb, Detection(rgb, config.orb)
 
+    def look() -> Appearance:
+        rgb, detection = colour.result()
+        with clock.stage("orb"):
+            return Appearance(rgb, detection.keypoints())
+
+    colour = Once(decode)
+    finest = Once(lambda: colour.result()[1].finest.result())
     appearance = helper.submit(look)
     with clock.stage("decode_depth"):
         depth_m = _depth(images)
     intrinsics = calibration.colour.intrinsics
     with clock.stage("points"):
         cloud = surface_from_depth(depth_m, intrinsics, config.surface)
-    return Observed(depth_m, intrinsics, cloud, appearance, config)
+    return Observed(depth_m, intrinsics, cloud, appearance, finest, config)
 
 
 def _depth(images: EncodedImages) -> NDArray[np.float32]:

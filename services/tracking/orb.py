@@ -1,26 +1,17 @@
-"""ORB features spread over the image, with depth where it can be trusted."""
+"""ORB features with depth where it can be trusted."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import OrbConfig
+from services.tracking.detection import Keypoints, detect, no_keypoints
 from shared.camera import Intrinsics
 from shared.rectify import RgbdImage
-
-
-@dataclass(frozen=True)
-class Keypoints:
-    """ORB features of a colour image, best first."""
-
-    keypoints_px: NDArray[np.float32]  # [M, 2]
-    octaves: NDArray[np.uint8]  # [M]
-    descriptors: NDArray[np.uint8]  # [M, 32]
 
 
 @dataclass(frozen=True)
@@ -77,38 +68,6 @@ def extract_features(image: RgbdImage, config: OrbConfig) -> Features:
     return with_depth(detect(image.rgb, config), image.depth_m, config)
 
 
-def detect(
-    rgb: NDArray[np.uint8], config: OrbConfig, where: NDArray[np.bool_] | None = None
-) -> Keypoints:
-    """Detect where the mask [H, W] allows it, spread over cells, describe.
-
-    OpenCV keeps the strongest corners wherever they crowd; the pose wants them all over the image,
-    so more are detected and each cell gives its best ones in turn. ORB-SLAM, too, looks again at a
-    lower threshold where hardly anything is found.
-    """
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    mask = None if where is None else where.astype(np.uint8)
-    keypoints, descriptors = _orb(config.fast_threshold, config).detectAndCompute(grey, mask)
-    if len(keypoints) < config.few_features:
-        keypoints, descriptors = _orb(config.faint_threshold, config).detectAndCompute(grey, mask)
-    if not keypoints:
-        return _no_keypoints()
-    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
-    octaves = np.array([k.octave for k in keypoints], np.uint8)
-    responses = np.array([k.response for k in keypoints], np.float32)
-    chosen = spread(pixels, responses, config.cell_px, config.num_features)
-    assert descriptors is not None
-    return Keypoints(
-        pixels[chosen], octaves[chosen], np.ascontiguousarray(descriptors[chosen], np.uint8)
-    )
-
-
-def _orb(fast_threshold: int, config: OrbConfig) -> cv2.ORB:
-    return cv2.ORB.create(
-        nfeatures=config.num_detected, nlevels=config.num_levels, fastThreshold=fast_threshold
-    )
-
-
 def with_depth(keypoints: Keypoints, depth_m: NDArray[np.float32], config: OrbConfig) -> Features:
     """Look up each keypoint in the registered depth image.
 
@@ -133,7 +92,7 @@ def _max_spread(spreads: NDArray[np.float64], config: OrbConfig) -> float:
 
 def no_features() -> Features:
     """An image without any."""
-    none = _no_keypoints()
+    none = no_keypoints()
     return Features(
         none.keypoints_px,
         none.octaves,
@@ -141,35 +100,6 @@ def no_features() -> Features:
         np.zeros(0, np.float32),
         np.zeros(0, np.bool_),
     )
-
-
-def _no_keypoints() -> Keypoints:
-    return Keypoints(
-        np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), np.zeros((0, 32), np.uint8)
-    )
-
-
-def spread(
-    pixels: NDArray[np.float32], responses: NDArray[np.float32], cell_px: int, limit: int
-) -> NDArray[np.int64]:
-    """Indices of up to `limit` keypoints: the best of every cell, then the second best, ..."""
-    order = np.argsort(-responses, kind="stable")
-    ranks = _ranks_in_cells(pixels[order], cell_px)
-    return order[np.argsort(ranks, kind="stable")[:limit]]
-
-
-@numba.njit(cache=True, nogil=True)
-def _ranks_in_cells(pixels, cell_px):  # pragma: no cover - compiled
-    """How many keypoints before this one lie in the same cell, [M]."""
-    columns = int(pixels[:, 0].max() // cell_px) + 1
-    rows = int(pixels[:, 1].max() // cell_px) + 1
-    counts = np.zeros((rows, columns), np.int32)
-    ranks = np.empty(len(pixels), np.int32)
-    for n in range(len(pixels)):
-        row, column = int(pixels[n, 1] // cell_px), int(pixels[n, 0] // cell_px)
-        ranks[n] = counts[row, column]
-        counts[row, column] += 1
-    return ranks
 
 
 @numba.njit(cache=True, nogil=True)

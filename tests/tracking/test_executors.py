@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from services.tracking.executors import NoHelper, taken_over
+from services.tracking.executors import NoHelper, Once, taken_over
 
 
 def test_what_a_busy_thread_has_not_begun_is_done_here():
@@ -45,3 +45,30 @@ def test_an_error_of_the_thread_comes_here():
 
     with pytest.raises(ValueError, match="no number"):
         taken_over(future, lambda: 0)
+
+
+def test_work_that_two_threads_ask_for_is_done_by_the_first():
+    has_begun, may_end = threading.Event(), threading.Event()
+
+    def work() -> int:
+        has_begun.set()
+        may_end.wait()
+        return threading.get_ident()
+
+    once = Once(work)
+    with ThreadPoolExecutor(1) as helper:
+        theirs = helper.submit(once.result)
+        has_begun.wait()
+        may_end.set()
+
+        mine = once.result()
+
+    assert mine == theirs.result() != threading.get_ident()
+
+
+def test_an_error_of_shared_work_comes_to_everyone_who_asks():
+    once = Once(lambda: int("no number"))
+
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no number"):
+            once.result()

@@ -2,15 +2,17 @@ import dataclasses
 
 import cv2
 import numpy as np
+import pytest
 
 from services.tracking.config import OrbConfig, RelocalizationConfig
+from services.tracking.detection import detect, spread
 from services.tracking.matching import (
     match_by_descriptor,
     match_by_projection,
     popcount,
     two_nearest,
 )
-from services.tracking.orb import extract_features, spread
+from services.tracking.orb import extract_features
 from services.tracking.relocalization import locate
 from shared.rectify import RgbdImage
 from shared.se3 import angle_rad, exp, inverse, transform
@@ -49,6 +51,33 @@ def test_spreading_takes_the_best_of_each_cell_first():
     chosen = spread(pixels, responses, cell_px=40, limit=3)
 
     assert chosen.tolist() == [1, 3, 2]
+
+
+@pytest.mark.parametrize("axis", [0, 1], ids=["up and down", "left and right"])
+def test_keypoints_of_a_mirrored_image_are_mirrored_at_every_octave(room, axis):
+    rgb = room.view(np.eye(4)).rgb
+    size = np.array([rgb.shape[1], rgb.shape[0]])
+
+    found = detect(rgb, CONFIG)
+    mirrored = detect(np.ascontiguousarray(np.flip(rgb, axis)), CONFIG)
+
+    back = mirrored.keypoints_px.copy()
+    back[:, 1 - axis] = size[1 - axis] - 1 - back[:, 1 - axis]
+    for octave in np.flatnonzero(np.bincount(found.octaves) >= 10):
+        here = found.keypoints_px[found.octaves == octave]
+        there = back[mirrored.octaves == octave]
+        apart = np.linalg.norm(here[:, None] - there[None], axis=2).min(axis=1)
+        assert np.median(apart) < 0.05
+
+
+def test_a_mask_keeps_keypoints_of_every_octave_out(room):
+    rgb = room.view(np.eye(4)).rgb
+    is_left = np.arange(rgb.shape[1])[None, :] < np.full((rgb.shape[0], 1), 160)
+
+    found = detect(rgb, CONFIG, is_left)
+
+    assert found.keypoints_px[:, 0].max() < 161.0
+    assert len(np.unique(found.octaves)) > 3
 
 
 def test_an_image_without_texture_has_no_features(room):

@@ -151,7 +151,7 @@ def test_what_is_left_out_second_leaves_out_the_first_as_well(room):
     first = len(once.moving.octaves)
     assert 0 < first < len(both.moving.octaves)
     np.testing.assert_array_equal(both.moving.keypoints_px[:first], once.moving.keypoints_px)
-    u = both.features.keypoints_px[:, 0].astype(int)
+    u = np.rint(both.features.keypoints_px[:, 0])
     assert ((u >= 80) & (u < left.shape[1] - 80)).all()
 
 
