@@ -37,14 +37,14 @@ class RegistrationConfig:
     """Coarse-to-fine point-to-plane registration to the local map."""
 
     voxel_sizes_m: tuple[float, ...] = (0.20, 0.10, 0.05)
-    sample_steps: tuple[int, ...] = (8, 6, 4)
+    sample_steps: tuple[int, ...] = (12, 8, 4)
     max_iterations: tuple[int, ...] = (8, 8, 8)
     min_normal_cos: float = 0.7
     depth_sigma_floor_m: float = 0.002
     depth_sigma_per_m2: float = 0.002  # sigma = floor + this * z^2
     kernel_width: float = 2.0  # of the robust kernel, in residual scales
     min_kernel_width: float = 0.1  # in depth sigmas: exact depth still meets rounded edges
-    tolerances: tuple[float, ...] = (1e-3, 5e-4, 2e-4)  # of a step, metres and radians
+    tolerances: tuple[float, ...] = (5e-3, 2e-3, 2e-4)  # of a step, metres and radians
     min_eigenvalue_share: float = 1e-4  # directions below it keep the prediction
     effective_share: float = 0.1  # residuals of neighbours are not independent
     model_sigma: float = 0.02  # floor of the residual scale, in depth sigmas
@@ -130,6 +130,7 @@ class VerificationConfig:
     coarse_max_step_deg: float = 15.0
     explained_min_agreement: float = 0.95  # by geometry alone: no other start will do better
     explained_min_overlap: float = 0.4
+    max_unexplained: float = 0.1  # of the frame, less in the map than as predicted: look on
     brief_lost_frames: int = 3  # after more, a pose nearby must be as sure as one anywhere
     max_step_m: float = 1.0
     max_step_deg: float = 50.0

@@ -9,12 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.absolute_orientation import locate_by_points
+from services.tracking.belief import (
+    is_as_predicted,
+    is_coarse,
+    is_confirmed,
+    is_only_seen,
+    is_sure,
+)
 from services.tracking.config import TrackingConfig, VerificationConfig
 from services.tracking.estimate import Estimate, attempt, is_well_known
 from services.tracking.local_map import LocalMap, MapSource
 from services.tracking.moving import find_moving, known_moving
 from services.tracking.observed import Observed
 from services.tracking.prediction import is_predictable, predict, turned_starts
+from services.tracking.registration import overlap
 from services.tracking.relocalization import Recovery, is_found, locate, recover
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import Step, is_possible_step, step_between
@@ -152,11 +160,25 @@ def _starts(
 def _is_enough(job: Job, estimate: Estimate, T_predicted: NDArray[np.float64]) -> bool:
     """Nothing else needs to be tried."""
     config = job.config.verification
-    return (
-        is_found(job.observed, estimate, job.config)
-        or is_as_predicted(estimate, T_predicted, config)
-        or is_only_seen(estimate, config)
-    )
+    if is_as_predicted(estimate, T_predicted, config) or is_only_seen(estimate, config):
+        return True
+    is_beyond_doubt = is_found(job.observed, estimate, job.config)
+    return is_beyond_doubt and _is_explained(job, estimate, T_predicted)
+
+
+def _is_explained(job: Job, estimate: Estimate, T_predicted: NDArray[np.float64]) -> bool:
+    """Whether the map has as much of the frame as it would have from where it was expected.
+
+    On a pattern that repeats itself, features may agree with a place one period away; surfaces
+    that the map has from the right place are then missing.
+    """
+    config, voxels = job.config.registration, estimate.local.voxels.levels[0]
+
+    def share(T_world_camera: NDArray[np.float64]) -> float:
+        return overlap(job.observed.cloud, voxels, T_world_camera, config)
+
+    least = share(T_predicted) - job.config.verification.max_unexplained
+    return estimate.registration.overlap >= least or share(estimate.T_world_camera) >= least
 
 
 def _starts_around(job: Job, estimate: Estimate) -> list[NDArray[np.float64]]:
@@ -221,64 +243,6 @@ def _is_back(job: Job, estimate: Estimate, lost_frames: int) -> bool:
         is_confirmed(estimate, config)
         and estimate.agreement.share >= config.sure_agreement
         and estimate.registration.overlap >= config.explained_min_overlap
-    )
-
-
-def is_sure(estimate: Estimate, config: VerificationConfig) -> bool:
-    """Features and depth agree so well that nothing else needs to be tried."""
-    return estimate.inliers >= config.sure_inliers and _agrees(estimate, config)
-
-
-def is_as_predicted(
-    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
-) -> bool:
-    """About where it was expected, which takes fewer features to be sure of."""
-    limit = Step(config.near_step_m, config.near_step_deg)
-    return (
-        estimate.inliers >= config.sure_inliers_near
-        and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
-        and _agrees(estimate, config)
-    )
-
-
-def _agrees(estimate: Estimate, config: VerificationConfig) -> bool:
-    return (
-        estimate.agreement.share >= config.sure_agreement
-        and estimate.inlier_share >= config.min_inlier_share
-    )
-
-
-def is_confirmed(estimate: Estimate, config: VerificationConfig) -> bool:
-    """Features confirm the pose and depth does not refute it."""
-    return (
-        estimate.inliers >= config.min_inliers
-        and estimate.inlier_share >= config.min_inlier_share
-        and estimate.agreement.share >= config.min_agreement
-        and estimate.registration.overlap >= config.min_overlap
-    )
-
-
-def is_only_seen(estimate: Estimate, config: VerificationConfig) -> bool:
-    """An image without depth: its features alone hold the pose."""
-    return (
-        estimate.agreement.is_silent
-        and estimate.inliers >= config.sure_inliers_near
-        and estimate.inlier_share >= config.seen_min_inlier_share
-    )
-
-
-def is_coarse(
-    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
-) -> bool:
-    """Geometry alone holds the pose, about where it was expected.
-
-    Directions that the geometry leaves open keep the prediction; the covariance says how open.
-    """
-    limit = Step(config.coarse_max_step_m, config.coarse_max_step_deg)
-    return (
-        estimate.agreement.share >= config.coarse_min_agreement
-        and estimate.registration.overlap >= config.coarse_min_overlap
-        and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
     )
 
 
