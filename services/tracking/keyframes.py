@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.tracking.config import KeyframeRuleConfig, SurfaceConfig
+from services.tracking.config import KeyframeRuleConfig, TrackingConfig
 from services.tracking.orb import Features
 from services.tracking.point_cloud import BASE_PIXELS, normals_at
 from services.tracking.sharpness import edge_blur_px
@@ -60,11 +60,10 @@ class Sharpness:
         return float(np.sqrt(max(self.edge_blur_px**2 - self.usual_blur_px**2, 0.0)))
 
 
-def sharpness_of(image: RgbdImage, window: tuple[WindowKeyframe, ...]) -> Sharpness:
+def sharpness_of(edge_blur_px: float, window: tuple[WindowKeyframe, ...]) -> Sharpness:
     """A frame's sharpness; keyframes whose blur nobody knows are left out."""
     known = [keyframe.edge_blur_px for keyframe in window if keyframe.edge_blur_px > 0.0]
-    blur_px = edge_blur_px(image.rgb)
-    return Sharpness(blur_px, float(np.median(known)) if known else blur_px)
+    return Sharpness(edge_blur_px, float(np.median(known)) if known else edge_blur_px)
 
 
 def is_too_blurred(
@@ -143,28 +142,49 @@ def with_moving(observations: Observations, moving: Features) -> Observations:
 
 
 @dataclass(frozen=True)
-class KeyframeParts:
-    """What a keyframe is made of."""
+class KeyframeLooks:
+    """What a keyframe shows, wherever its window places it."""
 
-    image: RgbdImage
-    cloud_camera: PointCloud
-    observations: Observations
-    correction: Correction
+    landmark_normals_camera: NDArray[np.float32]  # [M, 3], at its features
+    cloud_camera: PointCloud  # thinned
+    thumbnail: NDArray[np.uint8]  # [15, 20]
+    edge_blur_px: float
+
+
+def keyframe_looks(
+    image: RgbdImage,
+    cloud_camera: PointCloud,
+    keypoints_px: NDArray[np.float32],
+    config: TrackingConfig,
+) -> KeyframeLooks:
+    """What needs no pose of a frame that becomes a keyframe.
+
+    Args:
+        image: colour and depth.
+        cloud_camera: its surface.
+        keypoints_px: where to look for normals, [M, 2].
+        config: of the surface and of keyframes.
+    """
+    normals = normals_at(image.depth_m, keypoints_px, image.intrinsics, config.surface)
+    return KeyframeLooks(
+        landmark_normals_camera=normals,
+        cloud_camera=thinned(cloud_camera, config.keyframe.max_cloud_points),
+        thumbnail=thumbnail_of(image.rgb),
+        edge_blur_px=edge_blur_px(image.rgb),
+    )
 
 
 def keyframe_data(
-    parts: KeyframeParts, surface: SurfaceConfig, config: KeyframeRuleConfig
+    looks: KeyframeLooks, observations: Observations, correction: Correction
 ) -> KeyframeData:
-    """Normals, the thinned cloud and the thumbnail beside the observations."""
-    image = parts.image
+    """What a keyframe brings to the map."""
     return KeyframeData(
-        observations=parts.observations,
-        landmark_normals_camera=normals_at(
-            image.depth_m, parts.observations.keypoints_px, image.intrinsics, surface
-        ),
-        cloud_camera=thinned(parts.cloud_camera, config.max_cloud_points),
-        thumbnail=thumbnail_of(image.rgb),
-        correction=parts.correction,
+        observations=observations,
+        landmark_normals_camera=looks.landmark_normals_camera,
+        cloud_camera=looks.cloud_camera,
+        thumbnail=looks.thumbnail,
+        correction=correction,
+        edge_blur_px=looks.edge_blur_px,
     )
 
 

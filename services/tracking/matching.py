@@ -212,7 +212,7 @@ def _two_nearest(words, others):  # pragma: no cover - compiled
     nearest = np.empty(len(words), np.int64)
     bits = np.empty(len(words), np.int64)
     second_bits = np.empty(len(words), np.int64)
-    distances = np.empty(others.shape[1], np.int64)
+    distances = np.empty(others.shape[1], np.int32)
     for m in range(len(words)):
         a, b, c, d = words[m]
         for n in range(others.shape[1]):  # vectors: no branch before all distances are there
@@ -222,14 +222,21 @@ def _two_nearest(words, others):  # pragma: no cover - compiled
                 + popcount(others[2, n] ^ c)
                 + popcount(others[3, n] ^ d)
             )
-        best, first, second = 0, 257, 257
-        for n in range(others.shape[1]):
-            if distances[n] < first:
-                best, first, second = n, distances[n], first
-            elif distances[n] < second:
-                second = distances[n]
-        nearest[m], bits[m], second_bits[m] = best, first, second
+        first, best = _least(distances), 0
+        while distances[best] != first:
+            best += 1
+        distances[best] = 257
+        nearest[m], bits[m], second_bits[m] = best, first, _least(distances)
     return nearest, bits, second_bits
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _least(values):  # pragma: no cover - compiled
+    """The smallest of some numbers of bits; a vector at a time."""
+    least = np.int32(257)
+    for n in range(len(values)):
+        least = min(least, values[n])
+    return least
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -103,13 +103,21 @@ class Observed:
             is_moving=is_moving,
         )
 
-    def wait(self) -> None:
-        """Until the features are found; those of the finest octave here, unless they are by now.
+    def find_finest(self) -> None:
+        """Find the keypoints of the finest octave here, unless they are by now.
 
         Raises:
             InputError: the colour image cannot be decoded.
         """
         self.finest.result()
+
+    def wait(self) -> None:
+        """Until the features are found.
+
+        Raises:
+            InputError: the colour image cannot be decoded.
+        """
+        self.find_finest()
         self.appearance.result()
 
 

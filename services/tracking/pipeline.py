@@ -18,11 +18,11 @@ from services.tracking.estimate import Estimate, is_well_known, pose_covariance
 from services.tracking.executors import NoHelper, taken_over
 from services.tracking.keyframes import (
     Coverage,
-    KeyframeParts,
-    Sharpness,
+    KeyframeLooks,
     becomes_keyframe,
     is_too_blurred,
     keyframe_data,
+    keyframe_looks,
     keyframe_observations,
     nearest_reference,
     sharpness_of,
@@ -33,10 +33,9 @@ from services.tracking.loop_verification import find_loop
 from services.tracking.observed import EncodedImages, Observed, observe
 from services.tracking.prediction import brought_up
 from services.tracking.search import Found, Job, search
-from services.tracking.sharpness import edge_blur_px
 from services.tracking.stopwatch import Stopwatch
 from services.tracking.verification import step_between
-from services.tracking.window import NewKeyframe, adjust_window, first_correction
+from services.tracking.window import AdjustedKeyframe, NewKeyframe, adjust_window, first_correction
 from shared.frames import Prior, TrackingStatus, TrackRequest
 from shared.pixel_cells import cells_of
 from shared.se3 import inverse
@@ -73,6 +72,8 @@ def track(
     images = EncodedImages(request.frame.rgb, request.frame.depth, request.calibration)
     observed = observe(images, config, clock, helper)
     job = Job(request, observed, source, config, clock)
+    if not job.is_predictable:
+        observed.find_finest()  # wanted first, and the map may still be on its way
     with clock.stage("context"):
         local = source.local_map(request.prior.reference_seq if request.prior else -1)
     if local.context.num_keyframes == 0:
@@ -107,8 +108,7 @@ def _begin(job: Job) -> TrackResult:
     none = np.full(len(observed.features.octaves), NO_LANDMARK, np.int64)
     observations = keyframe_observations(seq, observed.features, none)
     correction = first_correction(seq, T, observations, observed.intrinsics)
-    parts = KeyframeParts(observed.image, observed.cloud, observations, correction)
-    data = keyframe_data(parts, job.config.surface, job.config.keyframe)
+    data = keyframe_data(_looks(job, observations), observations, correction)
     return TrackResult(
         seq=seq,
         t_ns=request.frame.t_ns,
@@ -121,7 +121,7 @@ def _begin(job: Job) -> TrackResult:
         inlier_share=0.0,
         map_revision=request.map_revision,
         timings_ms=job.clock.times(),
-        keyframe=replace(data, edge_blur_px=edge_blur_px(observed.image.rgb)),
+        keyframe=data,
     )
 
 
@@ -168,36 +168,38 @@ def _new_keyframe(job: Job, found: Found, helper: Executor) -> KeyframeData | No
     observations = keyframe_observations(frame.seq, observed.features, ids)
     observations = with_moving(observations, observed.moving)
     loop_search = helper.submit(_loop, job, estimate, observations)
-    look = partial(_sharpness, job, estimate)
+    look = partial(_looks, job, observations)
     looking = helper.submit(look)
-    data = _keyframe(job, estimate, observations)
-    sharpness = taken_over(looking, look)  # the search for a loop may take longer than the window
+    with job.clock.stage("bundle_adjustment"):
+        adjusted = _adjusted(job, estimate, observations)
+    looks = taken_over(looking, look)  # the search for a loop may take longer than the window
     loop = loop_search.result()
+    sharpness = sharpness_of(looks.edge_blur_px, estimate.local.context.window)
     if is_too_blurred(sharpness, coverage, observed.intrinsics, config.keyframe):
         return None
-    return replace(data, edge_blur_px=sharpness.edge_blur_px, loop=loop)
+    data = keyframe_data(looks, adjusted.observations, adjusted.correction)
+    cells = None if observed.is_moving is None else cells_of(observed.is_moving)
+    return replace(data, link=_link(estimate), moving_cells=cells, loop=loop)
 
 
-def _keyframe(job: Job, estimate: Estimate, observations: Observations) -> KeyframeData:
-    """The frame's part of the map, with its window adjusted to it."""
-    observed, config, context = job.observed, job.config, estimate.local.context
+def _adjusted(job: Job, estimate: Estimate, observations: Observations) -> AdjustedKeyframe:
+    """The keyframe with its window adjusted to it."""
     seq, T = job.request.frame.seq, estimate.T_world_camera
     new = NewKeyframe(seq, T, observations, estimate.registration)
-    with job.clock.stage("bundle_adjustment"):
-        adjusted = adjust_window(new, context, observed.intrinsics, config)
-    parts = KeyframeParts(
-        observed.image, observed.cloud, adjusted.observations, adjusted.correction
-    )
-    link = KeyframeLink(context.reference_seq, context.revision, estimate.information)
-    data = keyframe_data(parts, config.surface, config.keyframe)
-    cells = None if observed.is_moving is None else cells_of(observed.is_moving)
-    return replace(data, link=link, moving_cells=cells)
+    return adjust_window(new, estimate.local.context, job.observed.intrinsics, job.config)
 
 
-def _sharpness(job: Job, estimate: Estimate) -> Sharpness:
-    """How blurred a keyframe is beside those around."""
-    with job.clock.stage("sharpness"):
-        return sharpness_of(job.observed.image, estimate.local.context.window)
+def _link(estimate: Estimate) -> KeyframeLink:
+    """How firmly the keyframe hangs on the one it was tracked in."""
+    context = estimate.local.context
+    return KeyframeLink(context.reference_seq, context.revision, estimate.information)
+
+
+def _looks(job: Job, observations: Observations) -> KeyframeLooks:
+    """What the frame shows to a map, wherever its window places it."""
+    image, cloud = job.observed.image, job.observed.cloud
+    with job.clock.stage("looks"):
+        return keyframe_looks(image, cloud, observations.keypoints_px, job.config)
 
 
 def _loop(job: Job, estimate: Estimate, observations: Observations) -> LoopConstraint | None:

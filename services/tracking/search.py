@@ -39,6 +39,12 @@ class Job:
     config: TrackingConfig
     clock: Stopwatch
 
+    @property
+    def is_predictable(self) -> bool:
+        """Whether the camera is expected near enough to a known place to start from there."""
+        prior, config = self.request.prior, self.config.verification
+        return prior is not None and is_predictable(prior, self.request.frame, config)
+
     def attempt(self, local: LocalMap, T_start: NDArray[np.float64]) -> Estimate:
         """Register and refine from one starting pose."""
         return attempt(self.observed, local, T_start, self.config, self.clock)
@@ -147,8 +153,7 @@ def _starts(
     job: Job, local: LocalMap, prior: Prior, T_predicted: NDArray[np.float64]
 ) -> Iterator[NDArray[np.float64]]:
     """As predicted, where features say, where it was; in large steps features come first."""
-    is_near = is_predictable(prior, job.request.frame, job.config.verification)
-    T_located = None if is_near else job.locate_nearby(local)
+    T_located = None if job.is_predictable else job.locate_nearby(local)
     if T_located is not None:
         yield T_located
     yield T_predicted
