@@ -103,7 +103,7 @@ class MapperHost:
         Raises:
             InputError: the name, mode or calibration cannot be used.
             NotFoundError: no such session, and no calibration to create it with.
-            ConflictError: the session exists with another calibration, or another mapper owns it.
+            ConflictError: the session exists with other settings, or another mapper owns it.
             UnavailableError: this mapper has its fill of sessions.
             StorageError: the disk or the lease store refused, or the log is damaged.
         """
@@ -171,10 +171,11 @@ class MapperHost:
     def _put_away_idle(self) -> None:
         """Keep memory bounded: what nobody asks for goes to disk; opening it takes it up again."""
         idle_s = self._settings.config.owner.session_idle_s
-        with self._lock:
-            for name, served in list(self._served.items()):
+        for name, served in list(self._served.items()):
+            with self._lock:  # for one at a time: whoever opens another waits for one snapshot
                 is_idle = time.monotonic() - served.used_s > idle_s
-                if is_idle and not served.session.is_working:
+                is_here = self._served.get(name) is served
+                if is_here and is_idle and not served.session.is_working:
                     self._put_away(name)
                     LOGGER.info("%s: idle, put away", name)
 

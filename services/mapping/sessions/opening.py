@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+
 from services.mapping.sessions.ledger import Ledger
 from services.mapping.sessions.worker import LIVE, OFFLINE
 from services.mapping.storage.folders import SessionRecord
@@ -39,11 +41,17 @@ def check_same(record: SessionRecord, request: OpenRequest) -> None:
     """Creating a session again is fine if it means the same: the sender lost the reply.
 
     Raises:
-        ConflictError: the session has another calibration, mode or seed.
+        ConflictError: the session has another calibration, mode, seed or first pose.
     """
-    again = (request.mode, request.seed, codec.pack(request.calibration))
-    if again != (record.mode, record.seed, codec.pack(record.calibration)):
-        raise ConflictError(f"session {request.session} exists with other settings")
+    is_other = {
+        "mode": request.mode != record.mode,
+        "seed": request.seed != record.seed,
+        "calibration": codec.pack(request.calibration) != codec.pack(record.calibration),
+        "first pose": not np.array_equal(request.T_world_first, record.T_world_first),
+    }
+    if any(is_other.values()):
+        others = " and ".join(name for name, differs in is_other.items() if differs)
+        raise ConflictError(f"session {request.session} exists with another {others}")
 
 
 def opening_of(record: SessionRecord, mapper: str, ledger: Ledger) -> OpenReply:
