@@ -1,4 +1,4 @@
-"""A sequence folder as a bad day would deliver it: repeats, losses, black depth, another place.
+"""A sequence as a bad day would deliver it: repeats, losses, black depth, another place.
 
 Frames are played to and fro until there are enough of them, so that any sequence will do.
 """
@@ -21,7 +21,7 @@ from shared.se3 import inverse
 
 
 class Sequence(Protocol):
-    """Frames with their true poses, as `benchmarks.tracking_run.Folder` has them."""
+    """Frames with their true poses, as `benchmarks.true_sequence.TrueSequence` has them."""
 
     calibration: Calibration
 
@@ -60,18 +60,18 @@ class Sent:
     is_repeat: bool = False
 
 
-def disturbed(folder: Sequence, elsewhere: Sequence, plan: Plan) -> Iterator[Sent]:
-    """The frames of a folder with everything of the plan done to them."""
+def disturbed(sequence: Sequence, elsewhere: Sequence, plan: Plan) -> Iterator[Sent]:
+    """The frames of a sequence with everything of the plan done to them."""
     rng = np.random.default_rng(plan.seed)
-    shown = Sent(_holed(folder, 0, plan, rng), 0)
+    shown = Sent(_holed(sequence, 0, plan, rng), 0)
     step = 0
     for seq in range(plan.frames):
         if plan.away_from <= seq < plan.away_from + plan.away_for:
-            yield _elsewhere(folder, elsewhere, seq, plan)
+            yield _elsewhere(sequence, elsewhere, seq, plan)
             continue
         is_repeat = seq % plan.repeat_every == plan.repeat_every - 1
         if not is_repeat:
-            shown = Sent(_holed(folder, step, plan, rng), to_and_fro(step, len(folder)))
+            shown = Sent(_holed(sequence, step, plan, rng), to_and_fro(step, len(sequence)))
             step += 1
         if seq % plan.drop_every != plan.drop_every - 1:
             yield Sent(_stamped(shown.frame, seq, plan), shown.index, is_repeat)
@@ -186,12 +186,12 @@ def _black(
     return black
 
 
-def _holed(folder: Sequence, step: int, plan: Plan, rng: np.random.Generator) -> Frame:
-    """A frame of the folder that lacks some of its depth."""
-    frame = folder.frame(to_and_fro(step, len(folder)))
-    depth_m = decode_depth(frame.depth, folder.calibration)
+def _holed(sequence: Sequence, step: int, plan: Plan, rng: np.random.Generator) -> Frame:
+    """A frame of the sequence that lacks some of its depth."""
+    frame = sequence.frame(to_and_fro(step, len(sequence)))
+    depth_m = decode_depth(frame.depth, sequence.calibration)
     depth_m[_black(depth_m.shape, step, plan, rng)] = 0.0
-    return _with_depth(frame, depth_m, folder.calibration)
+    return _with_depth(frame, depth_m, sequence.calibration)
 
 
 def _with_depth(frame: Frame, depth_m: NDArray[np.float32], calibration: Calibration) -> Frame:
@@ -199,14 +199,14 @@ def _with_depth(frame: Frame, depth_m: NDArray[np.float32], calibration: Calibra
     return dataclasses.replace(frame, depth=encode_depth(raw, DepthEncoding.RAW16))
 
 
-def _elsewhere(folder: Sequence, elsewhere: Sequence, seq: int, plan: Plan) -> Sent:
+def _elsewhere(sequence: Sequence, elsewhere: Sequence, seq: int, plan: Plan) -> Sent:
     """A frame of another sequence in this one's size and depth scale."""
     other = elsewhere.frame(to_and_fro(seq - plan.away_from, len(elsewhere)))
-    size = folder.calibration.colour.intrinsics
+    size = sequence.calibration.colour.intrinsics
     rgb = decode_colour(other.rgb, elsewhere.calibration.colour.intrinsics)
     rgb = cv2.resize(rgb, (size.width, size.height)).astype(np.uint8)
     depth_m = decode_depth(other.depth, elsewhere.calibration)
     depth_m = cv2.resize(depth_m, (size.width, size.height), interpolation=cv2.INTER_NEAREST)
     frame = dataclasses.replace(other, rgb=encode_jpeg(rgb))
-    frame = _with_depth(frame, np.asarray(depth_m, np.float32), folder.calibration)
+    frame = _with_depth(frame, np.asarray(depth_m, np.float32), sequence.calibration)
     return Sent(_stamped(frame, seq, plan), None)

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.disturbances import to_and_fro
-from benchmarks.tracking import Folder
+from benchmarks.true_sequence import TrueSequence
 from pointslam.process import DEFAULT_ENVIRONMENT
 from services.gateway.prior import next_prior
 from services.mapping.keyframes.contexts import Contexts
@@ -90,26 +90,26 @@ def worker(endpoint: str) -> Iterator[Process]:
             process.terminate()
 
 
-def run(folder: Folder, name: str, frames: int) -> Row:
-    """Track so many frames of a folder."""
+def run(sequence: TrueSequence, name: str, frames: int) -> Row:
+    """Track so many frames of a sequence."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     router = open_router(endpoint)
     try:
         with open_bus([endpoint]) as bus, worker(endpoint) as process:
-            return _measure(bus, process, folder, name, frames)
+            return _measure(bus, process, sequence, name, frames)
     finally:
         router.close()
 
 
-def _measure(bus: Bus, process: Process, folder: Folder, name: str, frames: int) -> Row:
+def _measure(bus: Bus, process: Process, sequence: TrueSequence, name: str, frames: int) -> Row:
     served = _Map(bus)
     prior: Prior | None = None
     cpu_s, rss_mb = [], {}
     for seq in range(frames):
         before_s = process.cpu_s()
-        prior = _track(bus, folder, served, seq, prior)
+        prior = _track(bus, sequence, served, seq, prior)
         cpu_s.append(process.cpu_s() - before_s)
         if (seq + 1) % (5 * _SPAN) == 0 or seq + 1 in (_SPAN, frames):
             rss_mb[seq + 1] = round(process.rss_mb(), 1)
@@ -149,10 +149,12 @@ class _Map:
             return self._store.candidates(request)
 
 
-def _track(bus: Bus, folder: Folder, served: _Map, seq: int, prior: Prior | None) -> Prior | None:
-    frame = folder.frame(to_and_fro(seq, len(folder)))
+def _track(
+    bus: Bus, sequence: TrueSequence, served: _Map, seq: int, prior: Prior | None
+) -> Prior | None:
+    frame = sequence.frame(to_and_fro(seq, len(sequence)))
     frame = dataclasses.replace(frame, seq=seq, t_ns=seq * _PERIOD_NS)
-    revision, calibration = served.revision, folder.calibration
+    revision, calibration = served.revision, sequence.calibration
     request = TrackRequest(_SESSION, 1, revision, calibration, frame, prior, np.eye(4))
     result = bus.query(Keys.track(_SESSION), request, TrackResult, _PATIENCE_S)
     if result.keyframe is not None:
@@ -161,7 +163,7 @@ def _track(bus: Bus, folder: Folder, served: _Map, seq: int, prior: Prior | None
 
 
 def main(argv: list[str]) -> int:
-    """Run over the folder named in argv and print the figures."""
+    """Run over the sequence named in argv and print the figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -169,7 +171,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args(argv)
-    row = run(Folder(arguments.sequence), arguments.sequence.name, arguments.frames)
+    row = run(TrueSequence(arguments.sequence), arguments.sequence.name, arguments.frames)
     print(row)
     if arguments.json:
         arguments.json.write_text(json.dumps(asdict(row), indent=1))

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 
 from benchmarks.disturbances import CarriedPlane, Plan, Sent, Sequence, disturbed
-from benchmarks.tracking_run import Folder, StoreSource
+from benchmarks.tracking_run import StoreSource
+from benchmarks.true_sequence import TrueSequence
 from services.gateway.prior import next_prior
 from services.mapping.keyframes.store import KeyframeStore
 from services.tracking.config import TrackingConfig
@@ -69,7 +70,7 @@ class Row:
 
 
 def run(
-    folder: Sequence, elsewhere: Sequence, plan: Plan, config: TrackingConfig
+    sequence: Sequence, elsewhere: Sequence, plan: Plan, config: TrackingConfig
 ) -> list[Answered]:
     """Track the disturbed frames in order."""
     store = KeyframeStore()
@@ -77,12 +78,12 @@ def run(
     index_of: dict[int, int] = {}
     prior: Prior | None = None
     answers = []
-    for sent in disturbed(folder, elsewhere, plan):
+    for sent in disturbed(sequence, elsewhere, plan):
         request = TrackRequest(
             session="reliability",
             epoch=1,
             map_revision=store.revision,
-            calibration=folder.calibration,
+            calibration=sequence.calibration,
             frame=sent.frame,
             prior=prior,
             T_world_first=np.eye(4),
@@ -92,7 +93,7 @@ def run(
             store.insert(result.seq, result.t_ns, result.T_world_camera, result.keyframe)
         if sent.index is not None:
             index_of[result.seq] = sent.index
-        answers.append(Answered(sent, result, _error(folder, sent, result, index_of)))
+        answers.append(Answered(sent, result, _error(sequence, sent, result, index_of)))
         prior = next_prior(prior, sent.frame, _in_present_map(result, store))
     return answers
 
@@ -106,14 +107,14 @@ def _in_present_map(result: TrackResult, store: KeyframeStore) -> TrackResult:
 
 
 def _error(
-    folder: Sequence, sent: Sent, result: TrackResult, index_of: dict[int, int]
+    sequence: Sequence, sent: Sent, result: TrackResult, index_of: dict[int, int]
 ) -> Step | None:
     """Between the true and the told pose in the reference keyframe."""
     if sent.index is None or result.reference_seq not in index_of:
         return None
-    true_reference = folder.true_pose(index_of[result.reference_seq])
+    true_reference = sequence.true_pose(index_of[result.reference_seq])
     told = true_reference @ result.T_reference_camera
-    return step_between(folder.true_pose(sent.index), told)
+    return step_between(sequence.true_pose(sent.index), told)
 
 
 def row_of(name: str, answers: list[Answered], plan: Plan) -> Row:
@@ -169,7 +170,7 @@ def _sibling(path: Path) -> Path:
 
 
 def main(argv: list[str]) -> int:
-    """Run over the folders named in argv; 1 where a wrong pose was believed."""
+    """Run over the sequences named in argv; 1 where a wrong pose was believed."""
     arguments = _arguments(argv)
     cv2.setNumThreads(1)
     config = override(TrackingConfig(), read_overrides(None, arguments.set))
@@ -177,11 +178,11 @@ def main(argv: list[str]) -> int:
     plan = Plan(frames=arguments.frames, away_from=away_from)
     rows = []
     for path in arguments.sequences:
-        elsewhere = Folder(arguments.elsewhere or _sibling(path))
-        folder: Sequence = Folder(path)
+        elsewhere = TrueSequence(arguments.elsewhere or _sibling(path))
+        sequence: Sequence = TrueSequence(path)
         if arguments.carried > 0.0:
-            folder = CarriedPlane(folder, arguments.carried)
-        answers = run(folder, elsewhere, plan, config)
+            sequence = CarriedPlane(sequence, arguments.carried)
+        answers = run(sequence, elsewhere, plan, config)
         rows.append(row_of(path.name, answers, plan))
         print(rows[-1], flush=True)
         if arguments.verbose:

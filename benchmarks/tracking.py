@@ -1,4 +1,4 @@
-"""Tracking alone, in process, over sequence folders, beside itself with less and its peers.
+"""Tracking alone, in process, over sequences, beside itself with less and its peers.
 
 Times are a worker's on a map whose owner has the next neighbourhood ready: from the frame in hand
 to the answer, with the waiting for what is fetched, unpacked and derived beside.
@@ -20,10 +20,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.tracking_run import Folder, Row, run
+from benchmarks.tracking_run import Row, run
 from benchmarks.tracking_variants import PeerRow, ablation, peers
+from benchmarks.true_sequence import TrueSequence
 from services.tracking.config import TrackingConfig
 from shared.config import override, read_overrides
+from shared.errors import PointSlamError
 
 _HEADER = (
     "sequence / variant / peer   frames lost coarse reloc  kfs ateOnl.cm ateFin.cm  "
@@ -102,11 +104,11 @@ def _arguments(argv: list[str]) -> argparse.Namespace:
 
 def _measure(path: Path, arguments: argparse.Namespace, config: TrackingConfig) -> dict[str, Any]:
     """One sequence: a row of the table as plain values, printed unless JSON goes to the screen."""
-    folder = Folder(path, arguments.max_depth_m, arguments.depth_frames)
-    indices = list(range(0, len(folder), arguments.stride))[: arguments.frames]
-    row = run(folder, path.name, indices, config)
-    variants = [] if arguments.alone else ablation(folder, indices, config)
-    others = [] if arguments.alone else peers(folder, indices)
+    sequence = TrueSequence(path, arguments.max_depth_m, arguments.depth_frames)
+    indices = list(range(0, len(sequence), arguments.stride))[: arguments.frames]
+    row = run(sequence, path.name, indices, config)
+    variants = [] if arguments.alone else ablation(sequence, indices, config)
+    others = [] if arguments.alone else peers(sequence, indices)
     if arguments.json != "-":
         _print_row(row)
         _print_stages(row)
@@ -121,7 +123,7 @@ def _measure(path: Path, arguments: argparse.Namespace, config: TrackingConfig) 
 
 
 def main(argv: list[str]) -> int:
-    """Run over the folders named in argv and print a table or JSON."""
+    """Run over the sequences named in argv and print a table or JSON."""
     arguments = _arguments(argv)
     sequences = arguments.sequences or _default_sequences()
     if not sequences:
@@ -131,7 +133,11 @@ def main(argv: list[str]) -> int:
     config = override(TrackingConfig(), read_overrides(None, arguments.set))
     if arguments.json != "-":
         print(_HEADER)
-    rows = [_measure(path, arguments, config) for path in sequences]
+    try:
+        rows = [_measure(path, arguments, config) for path in sequences]
+    except PointSlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     if arguments.json:
         text = json.dumps(rows, indent=1)
         print(text) if arguments.json == "-" else Path(arguments.json).write_text(text)

@@ -1,16 +1,15 @@
-"""Tracking alone, in process, over a sequence folder: errors against truth, times by stage."""
+"""Tracking alone, in process, over a sequence: errors against truth, times by stage."""
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cold_worker import ColdWorker, cold_worker
+from benchmarks.true_sequence import TrueSequence
 from services.gateway.prior import next_prior
 from services.mapping.keyframes.store import KeyframeConfig, KeyframeStore
 from services.tracking.config import TrackingConfig
@@ -18,71 +17,13 @@ from services.tracking.executors import NoHelper
 from services.tracking.local_map import LocalMap
 from services.tracking.pipeline import track
 from shared import codec
-from shared.camera import Calibration, Camera, Intrinsics
-from shared.frames import (
-    HAS_POSE,
-    ColourEncoding,
-    ColourImage,
-    DepthEncoding,
-    DepthImage,
-    Frame,
-    Prior,
-    TrackingStatus,
-    TrackRequest,
-)
-from shared.se3 import angle_rad, from_quat_xyzw, inverse
+from shared.frames import HAS_POSE, Prior, TrackingStatus, TrackRequest
+from shared.se3 import angle_rad, inverse
 from shared.tracks import Candidates, CandidatesRequest, TrackingContext, TrackResult
 
 Poses = NDArray[np.float64]  # [F, 4, 4]
 _Key = tuple[int, int, bool]  # revision, seq of the reference, near only
 _SPAN = 100  # frames whose times are compared
-
-
-class Folder:
-    """A sequence folder with calibration.json, associations.txt and groundtruth.txt.
-
-    As of a sensor that sees no farther than `max_depth_m`, or fails after so many `depth_frames`.
-    """
-
-    def __init__(self, path: Path, max_depth_m: float = 20.0, depth_frames: float = np.inf) -> None:
-        self._path = path
-        self._depth_frames = depth_frames
-        values = json.loads((path / "calibration.json").read_text())
-        names = ("fx", "fy", "cx", "cy", "width", "height")
-        camera = Camera(Intrinsics(*(values[name] for name in names)))
-        self.calibration = Calibration(camera, values["depth_scale"], max_depth_m=max_depth_m)
-        self._rows = [line.split() for line in _lines(path / "associations.txt")]
-        self._truth = np.loadtxt(path / "groundtruth.txt", ndmin=2)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def frame(self, index: int) -> Frame:
-        """One frame; every eighth is held out of the map, as an evaluation run does."""
-        stamp, colour, _, depth = self._rows[index]
-        return Frame(
-            seq=index,
-            t_ns=round(float(stamp) * 1e9),
-            rgb=ColourImage(ColourEncoding.JPEG, (self._path / colour).read_bytes()),
-            depth=self._depth(depth if index < self._depth_frames else None),
-            may_be_keyframe=index % 8 != 4,
-        )
-
-    def _depth(self, name: str | None) -> DepthImage:
-        if name is not None:
-            return DepthImage(DepthEncoding.PNG16, (self._path / name).read_bytes())
-        size = self.calibration.colour.intrinsics
-        return DepthImage(DepthEncoding.RAW16, bytes(2 * size.width * size.height))
-
-    def true_pose(self, index: int) -> NDArray[np.float64]:
-        """T_world_camera of the nearest stamp."""
-        stamps = self._truth[:, 0]
-        row = self._truth[np.argmin(np.abs(stamps - float(self._rows[index][0])))]
-        return from_quat_xyzw(row[4:8], row[1:4])
-
-
-def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
 
 
 class StoreSource:
@@ -192,20 +133,20 @@ class Tracked:
 
 
 def run(
-    folder: Folder,
+    sequence: TrueSequence,
     name: str,
     indices: list[int],
     config: TrackingConfig,
     keyframes: KeyframeConfig | None = None,
 ) -> Row:
     """Track the frames in order, as `track_all` does, beside the truth."""
-    tracked = track_all(folder, indices, config, keyframes)
-    truth = np.stack([folder.true_pose(index) for index in indices])
+    tracked = track_all(sequence, indices, config, keyframes)
+    truth = np.stack([sequence.true_pose(index) for index in indices])
     return _row(name, tracked, truth, config)
 
 
 def track_all(
-    folder: Folder,
+    sequence: TrueSequence,
     indices: list[int],
     config: TrackingConfig,
     keyframes: KeyframeConfig | None = None,
@@ -217,7 +158,7 @@ def track_all(
     with ThreadPoolExecutor(1) as helper, ThreadPoolExecutor(1) as fetching:  # as a worker has
         source = StoreSource(store, config, fetching)
         for index in indices:
-            request = _request(folder, index, prior, store.revision)
+            request = _request(sequence, index, prior, store.revision)
             source.fetch_ahead(prior.reference_seq if prior else -1)
             result = track(request, source, config, helper)
             if result.keyframe is not None:
@@ -229,13 +170,15 @@ def track_all(
     return Tracked(results, store)
 
 
-def _request(folder: Folder, index: int, prior: Prior | None, revision: int) -> TrackRequest:
+def _request(
+    sequence: TrueSequence, index: int, prior: Prior | None, revision: int
+) -> TrackRequest:
     return TrackRequest(
         session="benchmark",
         epoch=1,
         map_revision=revision,
-        calibration=folder.calibration,
-        frame=folder.frame(index),
+        calibration=sequence.calibration,
+        frame=sequence.frame(index),
         prior=prior,
         T_world_first=np.eye(4),
     )
@@ -275,11 +218,12 @@ def _row(name: str, tracked: Tracked, truth: Poses, config: TrackingConfig) -> R
 def absolute_error(poses: Poses, truth: Poses) -> float:
     """ATE: root mean square distance after rigid alignment without scale (Umeyama), metres.
 
-    NaN for fewer than three poses: anything can be aligned to these.
+    NaN for fewer than three poses with truth: anything can be aligned to these.
     """
-    if len(poses) < 3:
+    is_known = np.isfinite(truth[:, 0, 0])
+    if is_known.sum() < 3:
         return float("nan")
-    a, b = poses[:, :3, 3], truth[:, :3, 3]
+    a, b = poses[is_known, :3, 3], truth[is_known, :3, 3]
     u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     aligned = (a - a.mean(0)) @ rotation.T + b.mean(0)
@@ -288,10 +232,12 @@ def absolute_error(poses: Poses, truth: Poses) -> float:
 
 def relative_errors(poses: Poses, truth: Poses, gap: int) -> tuple[float, float]:
     """RPE over a gap of frames: root mean squares in metres and degrees; NaN if too short."""
-    if len(poses) <= gap:
+    is_known = np.isfinite(truth[:, 0, 0])
+    from_rows = np.flatnonzero(is_known[:-gap] & is_known[gap:])
+    if len(from_rows) == 0:
         return float("nan"), float("nan")
-    steps = inverse(poses[:-gap]) @ poses[gap:]
-    true_steps = inverse(truth[:-gap]) @ truth[gap:]
+    steps = inverse(poses[from_rows]) @ poses[from_rows + gap]
+    true_steps = inverse(truth[from_rows]) @ truth[from_rows + gap]
     errors = inverse(true_steps) @ steps
     angles = [np.degrees(angle_rad(error)) for error in errors]
     distances = np.square(errors[:, :3, 3]).sum(axis=1)

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.peers.registry import PEERS, PeerEntry
-from benchmarks.tracking_run import Folder, Row, absolute_error, relative_errors, run
+from benchmarks.tracking_run import Row, absolute_error, relative_errors, run
+from benchmarks.true_sequence import TrueSequence
 from services.mapping.keyframes.loop_config import LoopConfig
 from services.mapping.keyframes.store import KeyframeConfig
 from services.tracking.config import TrackingConfig
@@ -47,33 +48,33 @@ class PeerRow:
     total_ms_p95: float = float("nan")
 
 
-def ablation(folder: Folder, indices: list[int], config: TrackingConfig) -> list[Row]:
+def ablation(sequence: TrueSequence, indices: list[int], config: TrackingConfig) -> list[Row]:
     """The tracker with parts taken away, on the same frames; `sequence` names the variant."""
     rows = []
     for name, settings in ABLATION.items():
         changed = override(config, read_overrides(None, list(settings)))
-        rows.append(replace(run(folder, name, indices, changed, _NO_LOOPS), cold_worker=None))
+        rows.append(replace(run(sequence, name, indices, changed, _NO_LOOPS), cold_worker=None))
     return rows
 
 
-def peers(folder: Folder, indices: list[int]) -> list[PeerRow]:
+def peers(sequence: TrueSequence, indices: list[int]) -> list[PeerRow]:
     """Every peer on the same frames, one after the other; absent ones are said to be absent."""
-    return [_peer_row(entry, folder, indices) for entry in PEERS]
+    return [_peer_row(entry, sequence, indices) for entry in PEERS]
 
 
-def _peer_row(entry: PeerEntry, folder: Folder, indices: list[int]) -> PeerRow:
+def _peer_row(entry: PeerEntry, sequence: TrueSequence, indices: list[int]) -> PeerRow:
     if importlib.util.find_spec(entry.library) is None:
         return PeerRow(entry.name, absent=f"{entry.library} is not installed")
     peer = entry.make()
     poses, times, tracked = [], [], 0
     for index in indices:
-        image = rectify(folder.frame(index), folder.calibration)
+        image = rectify(sequence.frame(index), sequence.calibration)
         start = time.perf_counter()
         pose = peer.track(image)
         times.append(1e3 * (time.perf_counter() - start))
         poses.append(pose.T_world_camera)
         tracked += pose.is_tracked
-    found, truth = np.stack(poses), np.stack([folder.true_pose(index) for index in indices])
+    found, truth = np.stack(poses), np.stack([sequence.true_pose(index) for index in indices])
     rpe1, rpe30 = relative_errors(found, truth, 1), relative_errors(found, truth, 30)
     return PeerRow(
         peer=entry.name,

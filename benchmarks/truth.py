@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.tracking_run import Folder, track_all
+from benchmarks.tracking_run import track_all
+from benchmarks.true_sequence import TrueSequence
 from services.tracking.config import RegistrationConfig, SurfaceConfig, TrackingConfig
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.registration import align, linearise
@@ -53,16 +54,16 @@ class Pair:
     grey: tuple[float, float] = (0.0, 0.0)  # under the first two
 
 
-def measure(folder: Folder, gap: int, step: int) -> list[Pair]:
+def measure(sequence: TrueSequence, gap: int, step: int) -> list[Pair]:
     """Every pair of frames `gap` apart whose surfaces overlap by half."""
-    indices = list(range(len(folder)))
-    tracked = track_all(folder, indices, TrackingConfig())
+    indices = list(range(len(sequence)))
+    tracked = track_all(sequence, indices, TrackingConfig())
     assert tracked.has_pose.all()
     poses = tracked.final_poses()
-    truth = np.stack([folder.true_pose(index) for index in indices])
+    truth = np.stack([sequence.true_pose(index) for index in indices])
     pairs: list[Pair] = []
     for i in range(0, len(indices) - gap, step):
-        image, moved = (rectify(folder.frame(j), folder.calibration) for j in (i, i + gap))
+        image, moved = (rectify(sequence.frame(j), sequence.calibration) for j in (i, i + gap))
         earlier, later = _surface(image), _surface(moved)
         true, ours = (inverse(p[i]) @ p[i + gap] for p in (truth, poses))
         pair = register_pair(earlier, later, true, ours)
@@ -145,7 +146,7 @@ def _print(name: str, pairs: list[Pair]) -> None:
 
 
 def main(argv: list[str]) -> int:
-    """Print the differences for the folders named in argv."""
+    """Print the differences for the sequences named in argv."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -155,7 +156,7 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     cv2.setNumThreads(1)
     for path in arguments.sequences:
-        _print(path.name, measure(Folder(path), arguments.gap, arguments.step))
+        _print(path.name, measure(TrueSequence(path), arguments.gap, arguments.step))
     return 0
 
 

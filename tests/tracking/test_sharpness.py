@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.tracking_run import Folder
+from benchmarks.true_sequence import TrueSequence
 from services.tracking.config import KeyframeRuleConfig
 from services.tracking.keyframes import Coverage, Sharpness, is_too_blurred, sharpness_of
 from services.tracking.sharpness import edge_blur_px, gradients
@@ -119,10 +119,10 @@ def test_without_keyframes_of_known_blur_a_frame_is_its_own_measure():
 
 def real_images(name: str) -> list[np.ndarray]:
     """Five images, evenly from a sequence."""
-    folder = Folder(DATA / name)
-    indices = range(0, len(folder), len(folder) // 5)[:5]
-    size = folder.calibration.colour.intrinsics
-    return [decode_colour(folder.frame(index).rgb, size) for index in indices]
+    sequence = TrueSequence(DATA / name)
+    indices = range(0, len(sequence), len(sequence) // 5)[:5]
+    size = sequence.calibration.colour.intrinsics
+    return [decode_colour(sequence.frame(index).rgb, size) for index in indices]
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="no sequences in $POINTSLAM_DATA or ../shared/data")
