@@ -17,7 +17,7 @@ from services.tracking.carried import StandingStill, standing_still, still_px
 from services.tracking.config import MovingConfig
 from services.tracking.local_map import LocalMap
 from services.tracking.observed import Observed
-from services.tracking.surfaces import Surfaces, surfaces_of
+from services.tracking.surfaces import Surfaces
 from shared.se3 import inverse
 
 _POINT_STEP = 4  # most of a surface needs not all of its points
@@ -54,7 +54,7 @@ def find_moving(
         T_world_camera: its pose as far as it is known, [4, 4].
         config: thresholds.
     """
-    surfaces = surfaces_of(observed.depth_m, config.grid_px, config.max_jump)
+    surfaces = observed.surfaces.result()
     still = standing_still(observed, local.seen, config)
     stays = _staying(observed, surfaces, still, config)
     if stays.any() and surfaces.median_m(stays) >= surfaces.median_m(~stays):
@@ -73,7 +73,7 @@ def known_moving(
     """
     if len(local.seen_moving.depths_m) < config.min_still:
         return None
-    surfaces = surfaces_of(observed.depth_m, config.grid_px, config.max_jump)
+    surfaces = observed.surfaces.result()
     still = standing_still(observed, local.seen_moving, config)
     return _mask(observed, surfaces, _staying(observed, surfaces, still, config), config)
 

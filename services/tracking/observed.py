@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.tracking.config import TrackingConfig
-from services.tracking.detection import Detected, Detection, Keypoints, detect
+from services.tracking.detection import Detected, Detection, detect
 from services.tracking.executors import NoHelper, Once
 from services.tracking.orb import Features, no_features, with_depth
 from services.tracking.point_cloud import surface_from_depth
 from services.tracking.stopwatch import Stopwatch
+from services.tracking.surfaces import Surfaces, surfaces_of
 from shared.camera import Calibration, Intrinsics
 from shared.frames import ColourImage, DepthImage
 from shared.rectify import RgbdImage, rectify_colour, rectify_depth
@@ -40,7 +41,7 @@ class Appearance:
     """What the colour image shows."""
 
     rgb: NDArray[np.uint8]  # [H, W, 3]
-    keypoints: Keypoints
+    features: Features  # with depth where it can be trusted
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Observed:
     cloud: PointCloud  # camera frame
     appearance: Future[Appearance]
     finest: Once[Detected]  # keypoints of the finest octave, for whoever has to wait
+    surfaces: Once[Surfaces]
     config: TrackingConfig
     moving: Features = field(default_factory=no_features)  # of what moves, left out above
     is_moving: NDArray[np.bool_] | None = None  # [H, W], its pixels; None: nothing moves
@@ -65,14 +67,14 @@ class Observed:
         """
         return RgbdImage(self.appearance.result().rgb, self.depth_m, self.intrinsics)
 
-    @cached_property
+    @property
     def features(self) -> Features:
         """Features, with depth where it can be trusted; waits until they are found.
 
         Raises:
             InputError: the colour image cannot be decoded.
         """
-        return with_depth(self.appearance.result().keypoints, self.depth_m, self.config.orb)
+        return self.appearance.result().features
 
     def without(self, moving: NDArray[np.bool_]) -> Observed:
         """The frame as if nothing were to be seen at some pixels, [H, W]; waits for features.
@@ -90,14 +92,16 @@ class Observed:
         pixels = np.rint(self.features.keypoints_px).astype(np.int64)
         u, v = pixels.clip(0, [i.width - 1, i.height - 1]).T
         on_it = np.flatnonzero(moving[v, u] & (self.features.depths_m > 0.0))
-        rgb = self.appearance.result().rgb
-        found = Appearance(rgb, detect(rgb, self.config.orb, ~is_moving))
+        rgb, orb = self.appearance.result().rgb, self.config.orb
+        depth_m = np.where(moving, np.float32(0.0), self.depth_m)
+        found = Appearance(rgb, with_depth(detect(rgb, orb, ~is_moving), depth_m, orb))
         return Observed(
-            depth_m=np.where(moving, np.float32(0.0), self.depth_m),
+            depth_m=depth_m,
             intrinsics=i,
             cloud=PointCloud(points[stays], self.cloud.normals[stays]),
             appearance=NoHelper().submit(lambda: found),
             finest=self.finest,
+            surfaces=_surfaces(depth_m, self.config),
             config=self.config,
             moving=self.moving.joined(self.features.rows(on_it)),
             is_moving=is_moving,
@@ -129,27 +133,35 @@ def observe(
     Raises:
         InputError: the depth image cannot be decoded.
     """
-    calibration = images.calibration
 
     def decode() -> tuple[NDArray[np.uint8], Detection]:
         with clock.stage("decode_colour"):
-            rgb = rectify_colour(images.rgb, calibration)
+            rgb = rectify_colour(images.rgb, images.calibration)
             return rgb, Detection(rgb, config.orb)
+
+    def decode_depth() -> NDArray[np.float32]:
+        with clock.stage("decode_depth"):
+            return _depth(images)
 
     def look() -> Appearance:
         rgb, detection = colour.result()
         with clock.stage("orb"):
-            return Appearance(rgb, detection.keypoints())
+            keypoints = detection.keypoints()
+        return Appearance(rgb, with_depth(keypoints, depth.result(), config.orb))
 
-    colour = Once(decode)
+    colour, depth = Once(decode), Once(decode_depth)
     finest = Once(lambda: colour.result()[1].finest.result())
     appearance = helper.submit(look)
-    with clock.stage("decode_depth"):
-        depth_m = _depth(images)
-    intrinsics = calibration.colour.intrinsics
+    depth_m, intrinsics = depth.result(), images.calibration.colour.intrinsics
     with clock.stage("points"):
         cloud = surface_from_depth(depth_m, intrinsics, config.surface)
-    return Observed(depth_m, intrinsics, cloud, appearance, finest, config)
+    surfaces = _surfaces(depth_m, config)
+    helper.submit(surfaces.result)
+    return Observed(depth_m, intrinsics, cloud, appearance, finest, surfaces, config)
+
+
+def _surfaces(depth_m: NDArray[np.float32], config: TrackingConfig) -> Once[Surfaces]:
+    return Once(lambda: surfaces_of(depth_m, config.moving.grid_px, config.moving.max_jump))
 
 
 def _depth(images: EncodedImages) -> NDArray[np.float32]:
