@@ -10,6 +10,14 @@ from services.tracking.estimate import Estimate
 from services.tracking.verification import Step, step_between
 
 
+def is_near(
+    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
+) -> bool:
+    """Not far from where it was expected."""
+    near = Step(config.near_step_m, config.near_step_deg)
+    return step_between(T_predicted, estimate.T_world_camera).is_within(near)
+
+
 def is_sure(estimate: Estimate, config: VerificationConfig) -> bool:
     """Features and depth agree so well that nothing else needs to be tried."""
     return estimate.inliers >= config.sure_inliers and _agrees(estimate, config)
@@ -19,10 +27,9 @@ def is_as_predicted(
     estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
 ) -> bool:
     """About where it was expected, which takes fewer features to be sure of."""
-    limit = Step(config.near_step_m, config.near_step_deg)
     return (
         estimate.inliers >= config.sure_inliers_near
-        and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
+        and is_near(estimate, T_predicted, config)
         and _agrees(estimate, config)
     )
 
@@ -34,12 +41,22 @@ def _agrees(estimate: Estimate, config: VerificationConfig) -> bool:
     )
 
 
-def is_confirmed(estimate: Estimate, config: VerificationConfig) -> bool:
-    """Features confirm the pose and depth does not refute it."""
+def is_confirmed(
+    estimate: Estimate, T_predicted: NDArray[np.float64], config: VerificationConfig
+) -> bool:
+    """Features confirm the pose and depth does not refute it.
+
+    A few features agree with the next diamond of a carpet too, but there part of the surface does
+    not: where they are few and the pose is not as expected, depth must agree as well.
+    """
+    may_be_alias = estimate.inliers < config.sure_inliers and not is_near(
+        estimate, T_predicted, config
+    )
+    least = config.sure_agreement if may_be_alias else config.min_agreement
     return (
         estimate.inliers >= config.min_inliers
         and estimate.inlier_share >= config.min_inlier_share
-        and estimate.agreement.share >= config.min_agreement
+        and estimate.agreement.share >= least
         and estimate.registration.overlap >= config.min_overlap
     )
 
@@ -61,8 +78,10 @@ def is_coarse(
     Directions that the geometry leaves open keep the prediction; the covariance says how open.
     """
     limit = Step(config.coarse_max_step_m, config.coarse_max_step_deg)
+    near = is_near(estimate, T_predicted, config)
+    least = config.coarse_min_overlap if near else config.coarse_min_overlap_far
     return (
         estimate.agreement.share >= config.coarse_min_agreement
-        and estimate.registration.overlap >= config.coarse_min_overlap
+        and estimate.registration.overlap >= least
         and step_between(T_predicted, estimate.T_world_camera).is_within(limit)
     )

@@ -126,6 +126,7 @@ class VerificationConfig:
     seen_min_inlier_share: float = 0.5  # without depth
     coarse_min_agreement: float = 0.85  # without features
     coarse_min_overlap: float = 0.08
+    coarse_min_overlap_far: float = 0.25  # beyond a near step from the prediction
     coarse_max_step_m: float = 0.3  # from the prediction
     coarse_max_step_deg: float = 15.0
     explained_min_agreement: float = 0.95  # by geometry alone: no other start will do better

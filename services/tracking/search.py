@@ -13,6 +13,7 @@ from services.tracking.belief import (
     is_as_predicted,
     is_coarse,
     is_confirmed,
+    is_near,
     is_only_seen,
     is_sure,
 )
@@ -25,7 +26,7 @@ from services.tracking.prediction import is_predictable, predict, turned_starts
 from services.tracking.registration import overlap
 from services.tracking.relocalization import Recovery, is_found, locate, recover
 from services.tracking.stopwatch import Stopwatch
-from services.tracking.verification import Step, is_possible_step, step_between
+from services.tracking.verification import is_possible_step
 from shared.frames import Prior, TrackingStatus, TrackRequest
 
 
@@ -44,6 +45,12 @@ class Job:
         """Whether the camera is expected near enough to a known place to start from there."""
         prior, config = self.request.prior, self.config.verification
         return prior is not None and is_predictable(prior, self.request.frame, config)
+
+    @property
+    def T_predicted(self) -> NDArray[np.float64]:
+        """Where the camera is expected, [4, 4]; of a frame with a prior."""
+        assert self.request.prior is not None
+        return predict(self.request.prior, self.request.frame)
 
     def attempt(self, local: LocalMap, T_start: NDArray[np.float64]) -> Estimate:
         """Register and refine from one starting pose."""
@@ -125,7 +132,7 @@ def _without_moving(job: Job, local: LocalMap, estimate: Estimate) -> tuple[Job,
         if moving is None:
             return job, estimate
         rest = replace(job, observed=job.observed.without(moving.mask))
-    found = _best([rest.attempt(local, T) for T in _starts_around(job, estimate)])
+    found = _best(rest, [rest.attempt(local, T) for T in _starts_around(job, estimate)])
     if not moving.is_confirmed(found.T_world_camera, job.observed, config):
         return job, estimate
     return rest, found
@@ -136,17 +143,17 @@ def _best_nearby(job: Job, local: LocalMap) -> Estimate | None:
     prior = job.request.prior
     if prior is None:
         return None
-    predicted = predict(prior, job.request.frame)
+    predicted = job.T_predicted
     tried: list[Estimate] = []
     for T_start in _starts(job, local, prior, predicted):
         tried.append(job.attempt(local, T_start))
         if _is_enough(job, tried[-1], predicted):
             return tried[-1]
-    best = _best(tried)
+    best = _best(job, tried)
     if prior.lost_frames > 0 or not _is_doubtful(best, predicted, job.config.verification):
         return best
     turned = turned_starts(predicted, job.config.registration.turn_deg)
-    return _best([best, *(job.attempt(local, T) for T in turned)])
+    return _best(job, [best, *(job.attempt(local, T) for T in turned)])
 
 
 def _starts(
@@ -188,12 +195,10 @@ def _is_explained(job: Job, estimate: Estimate, T_predicted: NDArray[np.float64]
 
 def _starts_around(job: Job, estimate: Estimate) -> list[NDArray[np.float64]]:
     """Where the camera was expected, and where it was found if that is elsewhere."""
-    assert job.request.prior is not None
-    config = job.config.verification
-    predicted = predict(job.request.prior, job.request.frame)
-    near = Step(config.near_step_m, config.near_step_deg)
-    is_near = step_between(predicted, estimate.T_world_camera).is_within(near)
-    return [predicted] if is_near else [predicted, estimate.T_world_camera]
+    predicted = job.T_predicted
+    if is_near(estimate, predicted, job.config.verification):
+        return [predicted]
+    return [predicted, estimate.T_world_camera]
 
 
 def _is_doubtful(
@@ -203,19 +208,21 @@ def _is_doubtful(
 
     What geometry leaves open stays at the start: a turned start that fits no better spoils it.
     """
-    near = Step(config.near_step_m, config.near_step_deg)
-    is_near = step_between(T_predicted, estimate.T_world_camera).is_within(near)
-    is_expected = is_near and is_coarse(estimate, T_predicted, config)
+    is_expected = is_near(estimate, T_predicted, config) and is_coarse(
+        estimate, T_predicted, config
+    )
     is_explained = (
         estimate.agreement.share >= config.explained_min_agreement
         and estimate.registration.overlap >= config.explained_min_overlap
     )
-    is_settled = is_confirmed(estimate, config) or is_expected or is_explained
+    is_settled = is_confirmed(estimate, T_predicted, config) or is_expected or is_explained
     return not (is_settled or estimate.agreement.is_silent)
 
 
-def _best(estimates: list[Estimate]) -> Estimate:
-    return max(estimates, key=lambda estimate: estimate.score)
+def _best(job: Job, estimates: list[Estimate]) -> Estimate:
+    """One that is confirmed before one that is not, whatever that has for itself."""
+    T_predicted, config = job.T_predicted, job.config.verification
+    return max(estimates, key=lambda e: (is_confirmed(e, T_predicted, config), e.score))
 
 
 def _status(job: Job, estimate: Estimate) -> TrackingStatus:
@@ -228,9 +235,9 @@ def _status(job: Job, estimate: Estimate) -> TrackingStatus:
     if prior.lost_frames > 0:
         is_back = is_possible and _is_back(job, estimate, prior.lost_frames)
         return TrackingStatus.TRACKED if is_back else TrackingStatus.LOST
-    if is_confirmed(estimate, config) and (is_possible or is_sure(estimate, config)):
+    T_predicted = job.T_predicted
+    if is_confirmed(estimate, T_predicted, config) and (is_possible or is_sure(estimate, config)):
         return TrackingStatus.TRACKED
-    T_predicted = predict(prior, job.request.frame)
     if is_coarse(estimate, T_predicted, config) or (is_possible and is_only_seen(estimate, config)):
         return TrackingStatus.COARSE_ONLY
     return TrackingStatus.LOST
@@ -245,7 +252,7 @@ def _is_back(job: Job, estimate: Estimate, lost_frames: int) -> bool:
     if lost_frames > config.brief_lost_frames:
         return is_found(job.observed, estimate, job.config)
     return (
-        is_confirmed(estimate, config)
+        is_confirmed(estimate, job.T_predicted, config)
         and estimate.agreement.share >= config.sure_agreement
         and estimate.registration.overlap >= config.explained_min_overlap
     )

@@ -45,7 +45,7 @@ def test_an_absent_peer_is_said_to_be_absent(monkeypatch):
     absent = PeerEntry("another tracker", "no_such_library", "benchmarks.peers.none", "None")
     monkeypatch.setattr(tracking_variants, "PEERS", (absent,))
 
-    (row,) = tracking_variants.peers(folder=None, indices=[])  # pyright: ignore
+    (row,) = tracking_variants.peers(sequence=None, indices=[])  # pyright: ignore
 
     assert row.absent == "no_such_library is not installed"
 
