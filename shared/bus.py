@@ -21,7 +21,7 @@ from shared import codec, tracing
 from shared.errors import ConfigError, GoneError, InputError, UnavailableError
 from shared.fabric import BusConfig, RouterConfig, answers, client_config, router_config
 from shared.keys import Keys
-from shared.replies import answer_query, read_reply
+from shared.replies import answer_query, read_reply, settle
 
 LOGGER = logging.getLogger(__name__)
 
@@ -137,13 +137,13 @@ class Bus:
         answered: asyncio.Future[Any] = loop.create_future()
         replies: list[zenoh.Reply] = []
 
-        def settle() -> None:
+        def bring() -> None:
             if not answered.done():
-                _settle(answered, replies, key, kind)
+                settle(answered, replies, key, kind)
 
         def wake() -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(settle)
+                loop.call_soon_threadsafe(bring)
 
         def hear(reply: zenoh.Reply) -> None:
             replies.append(reply)
@@ -153,8 +153,7 @@ class Bus:
             if not replies:  # a busy loop is woken once
                 wake()
 
-        # indirect=False: run on zenoh's own thread instead of one new thread a call.
-        handler = zenoh.handlers.Callback(hear, end, indirect=False)
+        handler = _on_zenohs_thread(hear, end)
         self._session.get(
             key,
             handler,
@@ -185,7 +184,8 @@ class Bus:
             else:
                 executor.submit(answer_query, query, key, kind, answer)
 
-        queryable = self._session.declare_queryable(key, handle, complete=True)
+        handler = handle if executor is None else _on_zenohs_thread(handle)
+        queryable = self._session.declare_queryable(key, handler, complete=True)
         self._declared.append(queryable)
 
         def stop() -> None:
@@ -212,7 +212,10 @@ class Bus:
         receive: Callable[[Any], None],
         is_news: Callable[[bytes], bool] = lambda _: True,
     ) -> Callable[[], None]:
-        """Call `receive` with each message that `is_news`; returns a function that stops it."""
+        """Call `receive` with each message that `is_news`; returns a function that stops it.
+
+        Both are called on zenoh's own thread: they must not wait.
+        """
 
         def handle(sample: zenoh.Sample) -> None:
             data = sample.payload.to_bytes()
@@ -223,7 +226,7 @@ class Bus:
             except InputError as error:
                 LOGGER.warning("%s: dropped a publication: %s", key, error)
 
-        subscriber = self._session.declare_subscriber(key, handle)
+        subscriber = self._session.declare_subscriber(key, _on_zenohs_thread(handle))
         self._declared.append(subscriber)
 
         def stop() -> None:
@@ -282,12 +285,8 @@ class Bus:
         return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
 
 
-def _settle(
-    answered: asyncio.Future[Any], replies: list[zenoh.Reply], key: str, kind: type
-) -> None:
-    try:
-        if not replies:
-            raise GoneError(f"nobody answers {key}")
-        answered.set_result(read_reply(replies[0], key, kind))
-    except Exception as error:  # whatever it is, it is for who waits
-        answered.set_exception(error)
+def _on_zenohs_thread(
+    hear: Callable[[Any], None], end: Callable[[], None] | None = None
+) -> zenoh.handlers.Callback[Any]:
+    """Called as it comes; a plain function would have a thread, and be kept alive by it."""
+    return zenoh.handlers.Callback(hear, end, indirect=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from shared.errors import (
     ClaimLostError,
     ConfigError,
     ConflictError,
+    GoneError,
     InputError,
     NotFoundError,
     PointSlamError,
@@ -64,6 +66,16 @@ def read_reply(reply: zenoh.Reply, key: str, kind: type) -> Any:
     if failure.code == InputError.code:
         raise InputError(failure.field, failure.text)
     raise _ERRORS.get(failure.code, PointSlamError)(failure.text)
+
+
+def settle(answered: asyncio.Future[Any], replies: list[zenoh.Reply], key: str, kind: type) -> None:
+    """Give who waits the message or the error of the first reply; GoneError without any."""
+    try:
+        if not replies:
+            raise GoneError(f"nobody answers {key}")
+        answered.set_result(read_reply(replies[0], key, kind))
+    except Exception as error:  # whatever it is, it is for who waits
+        answered.set_exception(error)
 
 
 @contextmanager

@@ -227,6 +227,17 @@ def test_publications_that_are_no_news_are_not_read(bus, other):
     assert set(heard) == {DeleteRequest("new")}
 
 
+def test_neither_a_subscriber_nor_one_who_answers_on_an_executor_takes_a_thread(bus):
+    before = threading.active_count()
+
+    with ThreadPoolExecutor() as executor:
+        for number in range(10):
+            bus.subscribe(f"ps/test/news/{number}", Empty, lambda _: None)
+            bus.serve(f"ps/test/questions/{number}", Empty, lambda request: request, executor)
+
+        assert threading.active_count() == before
+
+
 def test_a_publication_of_the_wrong_kind_is_dropped(bus, other):
     heard = []
     other.subscribe("ps/test/news", Empty, heard.append)
