@@ -6,6 +6,7 @@ waits for them.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 
@@ -29,4 +30,6 @@ def others_give_way(niceness: int) -> None:
     """
     for thread in threading.enumerate():
         if thread is not threading.current_thread() and thread.native_id is not None:
-            give_way(niceness, thread.native_id)
+            # One that ended meanwhile; those that a library started are listed for ever.
+            with contextlib.suppress(ProcessLookupError):
+                give_way(niceness, thread.native_id)

@@ -1,5 +1,7 @@
+import _thread
 import os
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 from services.mapping.priority import give_way, others_give_way
@@ -38,3 +40,15 @@ def test_the_threads_of_a_pool_give_way_to_the_one_that_asks_them_to():
 
         assert pool.submit(niceness).result() == min(before + 5, 19)
     assert niceness() == before
+
+
+def test_a_thread_of_a_library_that_has_ended_is_passed_over():
+    # Python keeps what it calls a dummy for a thread that it did not start, and does not see it go.
+    seen = []
+    _thread.start_new_thread(lambda: seen.append(threading.current_thread()), ())
+    while not seen or os.path.exists(f"/proc/self/task/{seen[0].native_id}"):
+        time.sleep(0.001)
+
+    others_give_way(0)
+
+    assert seen[0] in threading.enumerate()
