@@ -235,7 +235,7 @@ def test_neither_a_subscriber_nor_one_who_answers_on_an_executor_takes_a_thread(
             bus.subscribe(f"ps/test/news/{number}", Empty, lambda _: None)
             bus.serve(f"ps/test/questions/{number}", Empty, lambda request: request, executor)
 
-        assert threading.active_count() == before
+        assert threading.active_count() <= before  # one of another test may end
 
 
 def test_a_publication_of_the_wrong_kind_is_dropped(bus, other):
