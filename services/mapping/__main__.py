@@ -26,6 +26,7 @@ from shared.service import (
     stop_event,
 )
 from shared.tracing import setup_tracing
+from shared.warm_start import warm_start
 
 
 def device_named(name: str) -> torch.device:
@@ -58,7 +59,7 @@ def main(argv: list[str]) -> None:
         device=device_named(arguments.device),
     )
     serve_metrics(arguments)
-    warm_up()
+    warm_start(warm_up, stop)
     others_give_way(settings.config.owner.niceness)
     with open_bus(endpoints(arguments), settings.config.bus) as bus:
         host = MapperHost(bus, settings)

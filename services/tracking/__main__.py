@@ -32,6 +32,7 @@ from shared.service import (  # noqa: E402
     stop_event,
 )
 from shared.tracing import setup_tracing  # noqa: E402
+from shared.warm_start import warm_start  # noqa: E402
 
 
 def main(argv: list[str]) -> None:
@@ -49,7 +50,7 @@ def main(argv: list[str]) -> None:
     stop = stop_event()
     cv2.setNumThreads(1)  # frames of several sessions are what runs side by side
     serve_metrics(arguments)
-    warm_up(config)
+    warm_start(lambda: warm_up(config), stop)
     with (
         open_bus(endpoints(arguments), config.bus) as bus,
         ThreadPoolExecutor(config.concurrent_frames, "frame") as executor,
