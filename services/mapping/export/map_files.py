@@ -37,6 +37,13 @@ def write_map(file: BinaryIO, format: ExportFormat, visit: Visit, config: Export
         UnavailableError: the map is empty and the format cannot say so, or a package is absent.
     """
     give_back()
+    try:
+        _write(file, format, visit, config)
+    finally:
+        give_back()  # what was copied and fitted leaves a tenth of a gigabyte of holes
+
+
+def _write(file: BinaryIO, format: ExportFormat, visit: Visit, config: ExportConfig) -> None:
     if format in _SURFACES:
         file.write(_SURFACES[format](visit))
         return

@@ -41,6 +41,7 @@ from services.mapping.rasterizer.scene import (
     Rendered,
     ScreenStatistics,
     View,
+    WeightedSums,
 )
 from shared.camera import Intrinsics
 from shared.errors import ConfigError
@@ -53,6 +54,7 @@ __all__ = [
     "Rendered",
     "ScreenStatistics",
     "View",
+    "WeightedSums",
     "rasterizer_for",
     "warm_up",
 ]
@@ -78,3 +80,4 @@ def warm_up() -> None:
     view = View(np.eye(4), Intrinsics(32.0, 32.0, 15.5, 15.5, 32, 32))
     gaussians = Gaussians(means, scales, quats, opacities[:, 0], colours)
     CpuRasterizer()(gaussians, view).colour.sum().backward()
+    CpuRasterizer().with_sums(gaussians, view)[1](torch.ones(32, 32, 4))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,16 @@ from services.mapping.rasterizer.projection_backward import (
     Gradients,
     Pairs,
     add_sums,
+    first_sums,
     project_backward,
 )
-from services.mapping.rasterizer.scene import Gaussians, Rendered, ScreenStatistics, View
+from services.mapping.rasterizer.scene import (
+    Gaussians,
+    Rendered,
+    ScreenStatistics,
+    View,
+    WeightedSums,
+)
 from services.mapping.rasterizer.scratch import Scratch, scratch
 from services.mapping.rasterizer.simd import LANES
 from services.mapping.rasterizer.threads import Workers, default_threads, workers
@@ -58,6 +66,14 @@ class CpuRasterizer:
         run = _Run(self._engine, frame, screen)
         images = _Rasterize.apply(*gaussians.tensors(), view.pose(), run)
         return Rendered(*images, screen=screen)
+
+    def with_sums(self, gaussians: Gaussians, view: View) -> tuple[Rendered, WeightedSums]:
+        """Render without gradients; the sums take one pass over the tiles, see `Rasterizer`."""
+        gaussians.check()
+        frame = self._engine.prepare(gaussians, view)
+        screen = ScreenStatistics(torch.from_numpy(frame.projected.visible()))
+        rendered = Rendered(*self._engine.blend(frame), screen=screen)
+        return rendered, partial(self._engine.weighted_sums, frame)
 
 
 @dataclass(frozen=True)
@@ -107,13 +123,24 @@ class Engine:
         return colour.view(height, width, 3), depth.view(height, width), alpha.view(height, width)
 
     def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
-        if frame.lists is None:
-            pairs = self._sum_ranges(frame, images, gradients)
-        else:
-            pairs = self._sum_pairs(frame, frame.lists, images, gradients)
+        pairs = self._sum(frame, images, gradients)
         result = _empty_gradients(frame.projected.num_gaussians, self.scratch)
         self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
         return result
+
+    def weighted_sums(self, frame: _Frame, image: Tensor) -> Tensor:
+        """The last channel takes the place of depth: its derivative is a weight, too."""
+        rgb, nothing = _flat(image[..., :3]), np.zeros(image[..., 3].numel(), np.float32)
+        drawn = Images(np.zeros_like(rgb), nothing, nothing)  # matters to shapes only
+        pairs = self._sum(frame, drawn, Images(rgb, _flat(image[..., 3]), nothing))
+        sums = np.empty((frame.projected.num_gaussians, 4), np.float32)
+        self.pool.run(first_sums, pairs, sums)
+        return torch.from_numpy(sums)
+
+    def _sum(self, frame: _Frame, images: Images, gradients: Images) -> Pairs:
+        if frame.lists is None:
+            return self._sum_ranges(frame, images, gradients)
+        return self._sum_pairs(frame, frame.lists, images, gradients)
 
     def _empty_images(self, frame: _Frame) -> Images:
         borrow, pixels = self.scratch.borrow, frame.camera.height * frame.camera.width

@@ -14,6 +14,8 @@ from services.mapping.rasterizer.scene import (
     Rendered,
     ScreenStatistics,
     View,
+    WeightedSums,
+    sums_by_gradients,
 )
 from shared.errors import ConfigError
 
@@ -50,6 +52,10 @@ class GsplatRasterizer:
             render_mode="RGB+D",
         )
         return Rendered(images[0, ..., :3], images[0, ..., 3], alphas[0, ..., 0], _screen(meta))
+
+    def with_sums(self, gaussians: Gaussians, view: View) -> tuple[Rendered, WeightedSums]:
+        """Render without gradients; see `Rasterizer`."""
+        return sums_by_gradients(self, gaussians, view)
 
 
 def _import_gsplat() -> Any:

@@ -107,6 +107,21 @@ def add_sums(pairs, totals, counter):
                     store(totals.sums, target + k, total)
 
 
+@kernel
+def first_sums(pairs, sums, counter):
+    """Sum the colour's and the depth's part of each Gaussian's records over its tiles, [N, 4]."""
+    while True:
+        chunk = fetch_add(counter, 0, 1)
+        start, stop = chunk * CHUNK, min(chunk * CHUNK + CHUNK, len(pairs.starts) - 1)
+        if start >= stop:
+            return
+        for i in range(start, stop):
+            sums[i] = _ZERO
+            for slot in range(np.int64(pairs.starts[i]), np.int64(pairs.starts[i + 1])):
+                for k in range(DEPTH_SUM + 1):
+                    sums[i, k] += pairs.sums[slot * RECORD + k]
+
+
 @inlined
 def _sum_pairs(pairs, base, stop, target):
     """Sum each Gaussian's records over its tiles; gives whether the block has any.

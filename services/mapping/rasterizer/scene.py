@@ -12,7 +12,8 @@ Every backend follows the same definition, which `reference` spells out in float
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -141,6 +142,10 @@ class Rendered:
     screen: ScreenStatistics
 
 
+# Each Gaussian's sum of an image [H, W, 4] under its weights w in a view: [N, 4].
+WeightedSums = Callable[[Tensor], Tensor]
+
+
 class Rasterizer(Protocol):
     """A backend; differentiable in every field of the Gaussians and in the pose of the view."""
 
@@ -151,3 +156,31 @@ class Rasterizer(Protocol):
             InputError: a tensor has a wrong shape or type, or is not finite.
         """
         ...
+
+    def with_sums(self, gaussians: Gaussians, view: View) -> tuple[Rendered, WeightedSums]:
+        """Render without gradients, and keep what tells which Gaussian shows how much where.
+
+        Raises:
+            InputError: a tensor has a wrong shape or type, or is not finite.
+        """
+        ...
+
+
+def sums_by_gradients(
+    rasterizer: Rasterizer, gaussians: Gaussians, view: View
+) -> tuple[Rendered, WeightedSums]:
+    """`with_sums` of any backend: a pixel's derivative by a colour is that Gaussian's weight."""
+    detached = Gaussians(*(tensor.detach() for tensor in gaussians.tensors()))
+    colours = detached.colours.clone().requires_grad_()
+    with torch.enable_grad():
+        rendered = rasterizer(replace(detached, colours=colours), view)
+
+    def sums(image: Tensor) -> Tensor:
+        of_three, of_last = image[..., :3], image[..., 3:].expand(*image.shape[:2], 3)
+        grad = torch.autograd.grad
+        (first,) = grad(rendered.colour, colours, of_three.contiguous(), retain_graph=True)
+        (last,) = grad(rendered.colour, colours, of_last.contiguous(), retain_graph=True)
+        return torch.cat([first, last[:, :1]], dim=1)
+
+    images = (rendered.colour.detach(), rendered.depth.detach(), rendered.alpha.detach())
+    return Rendered(*images, screen=rendered.screen), sums

@@ -41,7 +41,7 @@ def fuse_colours(
     moves = _moves(look, torch.from_numpy(is_covered), appearance)
     steps = anchors.rows["steps"][look.visible.index]
     shares = half_steps / (half_steps + steps.float())
-    colours = look.colours.detach().clamp(_COLOUR_MARGIN, 1.0 - _COLOUR_MARGIN)
+    colours = look.colours.clamp(_COLOUR_MARGIN, 1.0 - _COLOUR_MARGIN)
     moved = colours + moves * shares.repeat_interleave(anchors.config.children)[:, None]
     moved = moved.clamp(_COLOUR_MARGIN, 1.0 - _COLOUR_MARGIN)
     change = (torch.logit(moved) - torch.logit(colours)).view(len(steps), -1)
@@ -50,13 +50,10 @@ def fuse_colours(
 
 def _moves(look: FirstLook, is_covered: Tensor, appearance: Appearance) -> Tensor:
     """Mean residual under the weights of each child, as colours of the map, [V * k, 3]."""
-    rendered = look.rendered.colour
-    rgb = torch.from_numpy(look.rgb).to(rendered)
-    open_share = (1.0 - look.rendered.alpha.detach())[..., None]
-    composite = rendered.detach() + open_share * appearance.background
+    rgb = torch.from_numpy(look.rgb).to(look.colours)
+    open_share = (1.0 - look.rendered.alpha)[..., None]
+    composite = look.rendered.colour + open_share * appearance.background
     residuals = (rgb - appearance.exposure[1]) / appearance.exposure[0] - composite
-    counted = is_covered[..., None].to(rgb).expand_as(rgb).contiguous()
-    grad = torch.autograd.grad
-    (sums,) = grad(rendered, look.colours, residuals * counted, retain_graph=True)
-    (weights,) = grad(rendered, look.colours, counted)
-    return sums / (weights + _LEAST_WEIGHT_PX)
+    counted = is_covered[..., None].to(rgb)
+    sums = look.weighted_sums(torch.cat([residuals * counted, counted], dim=2))
+    return sums[:, :3] / (sums[:, 3:] + _LEAST_WEIGHT_PX)

@@ -14,7 +14,7 @@ def uncovered_pixels(look: FirstLook, config: AnchorConfig) -> NDArray[np.bool_]
 
     "New Gaussian points are only added to non-overlapping regions of the new keyframe".
     """
-    alpha, depth_sum = look.rendered.alpha.detach(), look.rendered.depth.detach()
+    alpha, depth_sum = look.rendered.alpha, look.rendered.depth
     return uncovered(alpha.cpu().numpy(), depth_sum.cpu().numpy(), look.depth_m, config)
 
 

@@ -35,8 +35,8 @@ def fitted_exposure(
     is_known = _is_known(look, grid, config)
     if is_known.mean() < config.min_overlap:
         return None
-    alpha = look.rendered.alpha.detach().cpu().numpy()[grid][..., None]
-    drawn = look.rendered.colour.detach().cpu().numpy()[grid] / np.maximum(alpha, 0.5)
+    alpha = look.rendered.alpha.cpu().numpy()[grid][..., None]
+    drawn = look.rendered.colour.cpu().numpy()[grid] / np.maximum(alpha, 0.5)
     drawn, seen = drawn[is_known].astype(np.float64), look.rgb[grid][is_known]
     lines = [_line(drawn[:, c], seen[:, c], before[:, c], config) for c in range(3)]
     fitted = np.stack(lines, axis=1).astype(np.float32)
@@ -50,7 +50,7 @@ def _is_known(
     """Pixels of a grid whose surface both show."""
     depth_m, rgb = look.depth_m[grid], look.rgb[grid]
     gap_m = np.abs(look.depth_drawn_m()[grid] - depth_m)
-    is_known = look.rendered.alpha.detach().cpu().numpy()[grid] > config.min_alpha
+    is_known = look.rendered.alpha.cpu().numpy()[grid] > config.min_alpha
     is_known &= (depth_m > 0) & (gap_m < 0.02 + 0.05 * depth_m)
     return is_known & (rgb.max(axis=2) < 0.97) & (rgb.min(axis=2) > 0.02)
 
