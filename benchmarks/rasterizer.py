@@ -165,7 +165,8 @@ def _machine() -> dict[str, float | str]:
     frame = engine.prepare(gaussians, view)
     for _ in range(9):
         images = Images(*(image.numpy().reshape(-1) for image in engine.blend(frame)))
-        engine.differentiate(frame, images, images)
+        pairs = engine.gather(frame, images, images)
+        engine.differentiate(frame.splats, frame.camera, pairs)
     ours = pool.stages_ms()
     plain = PlainScene.of(frame.projected, frame.camera)
     plain_ms, pairs, peak = milliseconds(plain.blend, 3), plain.blend(), peak_gflops()

@@ -214,3 +214,13 @@ def test_the_device_picks_the_backend():
     assert isinstance(rasterizer_for("cpu"), CpuRasterizer)
     with pytest.raises(ConfigError, match="cpu"):
         rasterizer_for("tpu")
+
+
+def test_a_second_backward_pass_gives_the_same_gradients():
+    leaves = trainable(cloud(3000))
+    total = CpuRasterizer()(leaves, VIEW).colour.square().sum()
+
+    first = torch.autograd.grad(total, leaves.tensors(), retain_graph=True)
+    second = torch.autograd.grad(total, leaves.tensors())
+
+    assert all(map(torch.equal, first, second))

@@ -63,7 +63,7 @@ class CpuRasterizer:
         gaussians.check()
         frame = self._engine.prepare(gaussians, view)
         screen = ScreenStatistics(torch.from_numpy(frame.projected.visible()))
-        run = _Run(self._engine, frame, screen)
+        run = _Run(self._engine, gaussians, view, screen, frame)
         images = _Rasterize.apply(*gaussians.tensors(), view.pose(), run)
         return Rendered(*images, screen=screen)
 
@@ -122,25 +122,25 @@ class Engine:
         colour, depth, alpha = (torch.from_numpy(image) for image in images)
         return colour.view(height, width, 3), depth.view(height, width), alpha.view(height, width)
 
-    def differentiate(self, frame: _Frame, images: Images, gradients: Images) -> Gradients:
-        pairs = self._sum(frame, images, gradients)
-        result = _empty_gradients(frame.projected.num_gaussians, self.scratch)
-        self.pool.run(project_backward, frame.splats, frame.camera, pairs, result)
+    def gather(self, frame: _Frame, images: Images, gradients: Images) -> Pairs:
+        """What reaches the pairs of Gaussians and tiles; nothing else needs the frame's lists."""
+        if frame.lists is None:
+            return self._sum_ranges(frame, images, gradients)
+        return self._sum_pairs(frame, frame.lists, images, gradients)
+
+    def differentiate(self, splats: Splats, camera: Camera, pairs: Pairs) -> Gradients:
+        result = _empty_gradients(len(splats.opacities), self.scratch)
+        self.pool.run(project_backward, splats, camera, pairs, result)
         return result
 
     def weighted_sums(self, frame: _Frame, image: Tensor) -> Tensor:
         """The last channel takes the place of depth: its derivative is a weight, too."""
         rgb, nothing = _flat(image[..., :3]), np.zeros(image[..., 3].numel(), np.float32)
         drawn = Images(np.zeros_like(rgb), nothing, nothing)  # matters to shapes only
-        pairs = self._sum(frame, drawn, Images(rgb, _flat(image[..., 3]), nothing))
+        pairs = self.gather(frame, drawn, Images(rgb, _flat(image[..., 3]), nothing))
         sums = np.empty((frame.projected.num_gaussians, 4), np.float32)
         self.pool.run(first_sums, pairs, sums)
         return torch.from_numpy(sums)
-
-    def _sum(self, frame: _Frame, images: Images, gradients: Images) -> Pairs:
-        if frame.lists is None:
-            return self._sum_ranges(frame, images, gradients)
-        return self._sum_pairs(frame, frame.lists, images, gradients)
 
     def _empty_images(self, frame: _Frame) -> Images:
         borrow, pixels = self.scratch.borrow, frame.camera.height * frame.camera.width
@@ -173,13 +173,23 @@ class Engine:
         return totals
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
     """One forward pass, and where its backward pass leaves the statistics."""
 
     engine: Engine
-    frame: _Frame
+    gaussians: Gaussians
+    view: View
     screen: ScreenStatistics
+    frame: _Frame | None
+
+    def take_frame(self) -> _Frame:
+        """The frame, which is let go of with the last pair; made again for a second backward."""
+        frame, self.frame = self.frame, None
+        if frame is None:
+            frame = self.engine.prepare(self.gaussians, self.view)
+            self.engine.blend(frame)
+        return frame
 
 
 class _Rasterize(torch.autograd.Function):
@@ -199,7 +209,11 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
         images = _images(ctx.saved_tensors)
-        result = ctx.run.engine.differentiate(ctx.run.frame, images, _images(gradients))
+        engine, frame = ctx.run.engine, ctx.run.take_frame()
+        pairs = engine.gather(frame, images, _images(gradients))
+        splats, camera = frame.splats, frame.camera
+        del frame  # the gradients take its place in memory
+        result = engine.differentiate(splats, camera, pairs)
         ctx.run.screen.gradient_norm = torch.from_numpy(result.screen)
         fields = (
             torch.from_numpy(array.reshape(shape))
